@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from coliags_plugin.core.images import read_rgb
-from coliags_plugin.geometry.meshes.files import read_mesh
+from coliags_plugin.geometry.meshes.mesh import read_mesh
 from coliags_plugin.geometry.meshes.truth import compare_meshes, read_true_surface
 from coliags_plugin.geometry.poses import colmap
 from coliags_plugin.geometry.poses.alignment import FrameMatches, align

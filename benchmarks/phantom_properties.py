@@ -15,7 +15,7 @@ import numpy as np
 import tyro
 from machine import markdown_table
 
-from coliags_plugin.geometry.meshes.files import read_mesh
+from coliags_plugin.geometry.meshes.mesh import read_mesh
 
 #: Grey level of 255 from which a channel counts as saturated.
 SATURATED = 250

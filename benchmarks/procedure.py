@@ -37,12 +37,11 @@ from coliags_plugin.core.json_files import read_json
 from coliags_plugin.core.scene_files import read_intrinsics
 from coliags_plugin.datamanagers.reading.depth import C3VD_DEPTH
 from coliags_plugin.geometry.lenses.models import PinholeLens
-from coliags_plugin.geometry.meshes.files import read_mesh
-from coliags_plugin.geometry.meshes.mesh import TriangleMesh
+from coliags_plugin.geometry.meshes.mesh import TriangleMesh, read_mesh
 from coliags_plugin.geometry.meshes.truth import TrueSurface, compare_meshes
 from coliags_plugin.geometry.poses.alignment import Similarity
 from coliags_plugin.geometry.poses.colmap import model_suffix, read_images, read_points
-from coliags_plugin.geometry.poses.rigid import inverse, rigid
+from coliags_plugin.geometry.poses.trajectory import inverse, rigid
 from coliags_plugin.pipeline.contents import SegmentContents, SubmapContents, read_contents
 from coliags_plugin.pipeline.joins import ModelKey, SegmentJoin
 from coliags_plugin.pipeline.stages import Record

@@ -14,7 +14,7 @@ from coliags_plugin.engine import pose_refinement
 from coliags_plugin.engine.camera_path import CameraPath, Keyframe
 from coliags_plugin.export.baking import distillation
 from coliags_plugin.export.viewer.live import Viewer
-from coliags_plugin.geometry.meshes.files import read_mesh
+from coliags_plugin.geometry.meshes.mesh import read_mesh
 from tests.commands import run as command
 from tests.comparison.small import InlineExecutor
 from tests.pretended_cuda import CUDA, PretendedCuda

@@ -66,7 +66,7 @@ def measure_scene_coverage(data: str | Path, options: CoverageOptions) -> Measur
         InputError: An option is unknown, missing or invalid; the scene or the mesh cannot be read or do not belong
             together; or the folder exists or cannot be written.
     """
-    from coliags_plugin.geometry.meshes.files import read_mesh
+    from coliags_plugin.geometry.meshes.mesh import read_mesh
     from coliags_plugin.surface.coverage.visibility import CoverageSettings
     from coliags_plugin.surface.coverage.writing import measure_scene, open_recording
 

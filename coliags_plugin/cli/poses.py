@@ -263,7 +263,7 @@ class PosesAlignCommand:
 
 
 def _described(result: Alignment, unit: str) -> str:
-    from coliags_plugin.geometry.poses.rigid import rotation_angles_deg
+    from coliags_plugin.geometry.poses.trajectory import rotation_angles_deg
 
     angle = float(rotation_angles_deg(result.transform.rotation[None])[0])
     x, y, z = result.transform.translation

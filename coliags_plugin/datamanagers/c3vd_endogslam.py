@@ -39,7 +39,7 @@ from coliags_plugin.geometry.lenses.models import PinholeLens
 from coliags_plugin.geometry.poses import c3vd as c3vd_poses
 from coliags_plugin.geometry.poses.c3vd import C3vdPoses
 from coliags_plugin.geometry.poses.endogslam import EndoGslamParams, image_indices, read_params
-from coliags_plugin.geometry.poses.rigid import inverse, rigid, rotation_angles_deg
+from coliags_plugin.geometry.poses.trajectory import inverse, rigid, rotation_angles_deg
 
 log = logging.getLogger(__name__)
 

@@ -32,7 +32,7 @@ from coliags_plugin.datamanagers.recorded import RecordedDataManager, Recording,
 from coliags_plugin.datamanagers.scene_settings import POINTS_FILE, SceneSettings
 from coliags_plugin.datamanagers.shots import Shot, rectifications
 from coliags_plugin.geometry.lenses.models import PinholeLens
-from coliags_plugin.geometry.poses.rigid import FLIP_Y_AND_Z
+from coliags_plugin.geometry.poses.trajectory import FLIP_Y_AND_Z
 
 log = logging.getLogger(__name__)
 

@@ -23,7 +23,7 @@ from coliags_plugin.core.images import write_image
 from coliags_plugin.core.jobs import Progress
 from coliags_plugin.core.ply import point_properties, write_ply
 from coliags_plugin.geometry.poses.alignment import umeyama
-from coliags_plugin.geometry.poses.rigid import rigid
+from coliags_plugin.geometry.poses.trajectory import rigid
 from coliags_plugin.phantom.colon import ColonSurface, WallMotion, build_surface, frame_times, grow_anatomy, wall_motion
 from coliags_plugin.phantom.imaging import Exposure, Sensor, World, expose, meter
 from coliags_plugin.phantom.layouts.base import Layout, Part, PhantomFrame, WallPoints

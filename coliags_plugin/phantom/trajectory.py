@@ -17,7 +17,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation, Slerp
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.geometry.poses.rigid import rigid
+from coliags_plugin.geometry.poses.trajectory import rigid
 from coliags_plugin.phantom.colon import CentreLine, WallMotion, frame_times
 from coliags_plugin.phantom.settings import PhantomSettings
 from coliags_plugin.phantom.streams import GOLDEN_ANGLE, Purpose, quintic, stream

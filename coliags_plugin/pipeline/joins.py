@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from typing_extensions import Self
 
 from coliags_plugin.datamanagers.colmap import find_models, read_model
-from coliags_plugin.geometry.poses.rigid import inverse
+from coliags_plugin.geometry.poses.trajectory import inverse
 from coliags_plugin.pipeline.survey import Segment
 
 #: Fewest frames that both models have to have posed.

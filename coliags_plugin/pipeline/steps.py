@@ -14,8 +14,8 @@ from coliags_plugin.core.errors import InputError, InterruptedRunError, NotWrita
 from coliags_plugin.core.files import write_json
 from coliags_plugin.core.jobs import Progress
 from coliags_plugin.core.scene_files import Unit
-from coliags_plugin.datamanagers.colmap import find_models
-from coliags_plugin.geometry.meshes.files import MESH_FORMATS
+from coliags_plugin.datamanagers.colmap import ATLAS_FILE, find_models
+from coliags_plugin.geometry.meshes.mesh import MESH_FORMATS
 from coliags_plugin.geometry.poses import colmap
 from coliags_plugin.pipeline.frame_sources import Span, chosen_frames, frame_source
 from coliags_plugin.pipeline.frames import IMAGES, read_blurred, read_lens_mask, write_frames
@@ -262,7 +262,7 @@ def make_frames(context: StageContext) -> StageRecord:
 def make_poses(context: StageContext) -> StageRecord:
     """Estimate poses and points by structure from motion, and write them as a scene."""
     from coliags_plugin.engine.data_formats import UNKNOWN_MEDIAN_DEPTH
-    from coliags_plugin.reconstruction.structure.colmap_scene import RIBBON_FILE, write_sfm_scene
+    from coliags_plugin.reconstruction.structure.colmap_scene import write_sfm_scene
     from coliags_plugin.reconstruction.structure.image_files import list_images
     from coliags_plugin.reconstruction.structure.sfm import millimetres, reconstruct, scaled
 
@@ -279,7 +279,7 @@ def make_poses(context: StageContext) -> StageRecord:
         )
     warnings = []
     if (posed := count - len(atlas.lost)) < _MOST * count:
-        warnings.append(f"{posed} of {count} frames have a pose: poses/{RIBBON_FILE} shows why the others have none")
+        warnings.append(f"{posed} of {count} frames have a pose: poses/{ATLAS_FILE} says why the others have none")
     used = [model for model in atlas.models if model is largest or len(model.registered) >= settings.least_submap]
     factors = [millimetres(model, settings.diameter) for model in used]
     models = [
@@ -295,7 +295,7 @@ def make_poses(context: StageContext) -> StageRecord:
         if units[0] == "unknown"
         else f"unit mm, by a diameter of {settings.diameter:g} mm; median depth {depth:.3g} mm"
     )
-    files = {"poses": "scene in COLMAP's layout: images, poses, points", f"poses/{RIBBON_FILE}": "frames with a pose"}
+    files = {"poses": "scene in COLMAP's layout: images, poses, points"}
     return StageRecord(f"{atlas.summary()}; {unit}", files, warnings)
 
 
@@ -424,7 +424,7 @@ def mesh(context: StageContext) -> StageRecord:
 
 def coverage(context: StageContext) -> StageRecord:
     """Measure the share of the wall seen in the video; left out where it cannot be measured."""
-    from coliags_plugin.geometry.meshes.files import read_mesh
+    from coliags_plugin.geometry.meshes.mesh import read_mesh
     from coliags_plugin.surface.coverage.writing import measure_scene
 
     wall, folder = read_mesh(context.run / "mesh" / "mesh.ply"), context.run / "coverage"

@@ -20,7 +20,7 @@ from coliags_plugin.pipeline.frame_selection import corner_motion, lens_mask, ov
 from coliags_plugin.pipeline.frame_sources import FrameSource, watched
 from coliags_plugin.pipeline.settings import FrameSettings
 from coliags_plugin.pipeline.stages import MADE
-from coliags_plugin.reconstruction.structure.texture import sharpness
+from coliags_plugin.reconstruction.structure.point_tracks import sharpness
 from coliags_plugin.reconstruction.structure.video import cut_where_lost
 
 log = logging.getLogger(__name__)

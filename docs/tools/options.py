@@ -30,8 +30,12 @@ from coliags_plugin.core.settings import Settings
 from coliags_plugin.phantom.settings import PhantomSettings
 from coliags_plugin.pipeline.settings import FrameSettings, ReconstructionSettings
 from coliags_plugin.reconstruction.depth.sweeping import DepthEstimationSettings
-from coliags_plugin.reconstruction.structure.features import FeatureSettings
-from coliags_plugin.reconstruction.structure.sfm_settings import CameraSettings, SfmSettings, TrackSettings
+from coliags_plugin.reconstruction.structure.sfm_settings import (
+    CameraSettings,
+    FeatureSettings,
+    SfmSettings,
+    TrackSettings,
+)
 from coliags_plugin.surface.coverage.visibility import CoverageSettings
 from coliags_plugin.surface.meshing.views import MeshSettings
 

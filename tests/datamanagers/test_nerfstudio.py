@@ -19,7 +19,7 @@ from coliags_plugin.core.images import read_rgb
 from coliags_plugin.core.ply import point_properties, write_ply
 from coliags_plugin.datamanagers.recorded import Recording
 from coliags_plugin.geometry.lenses.models import FisheyeLens, Lens, OpenCVLens
-from coliags_plugin.geometry.poses.rigid import FLIP_Y_AND_Z
+from coliags_plugin.geometry.poses.trajectory import FLIP_Y_AND_Z
 from tests.datamanagers.kinds import change_frames, change_json
 from tests.datamanagers.wall_scenes import PINHOLE, load_scene, look, manager, off_wall, poses, rays, seen_from
 

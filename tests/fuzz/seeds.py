@@ -15,8 +15,7 @@ from coliags_plugin.api.training import train
 from coliags_plugin.config.options import SPLAT_FORMATS
 from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.export.splats.cloud import reader_of, write_splats
-from coliags_plugin.geometry.meshes.files import read_mesh, write_mesh
-from coliags_plugin.geometry.meshes.mesh import TriangleMesh
+from coliags_plugin.geometry.meshes.mesh import TriangleMesh, read_mesh, write_mesh
 from coliags_plugin.geometry.poses.formats import write_trajectory
 from coliags_plugin.geometry.poses.trajectory import Trajectory
 from coliags_plugin.reporting.video import write_video

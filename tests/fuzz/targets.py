@@ -22,7 +22,7 @@ from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.files import CHECKSUMS, write_checksums
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.export.splats.cloud import read_splats, reader_of
-from coliags_plugin.geometry.meshes.files import read_mesh
+from coliags_plugin.geometry.meshes.mesh import read_mesh
 from coliags_plugin.geometry.meshes.truth import compare_meshes, read_true_surface
 from coliags_plugin.geometry.poses.formats import format_of
 from coliags_plugin.pipeline.frame_sources import frame_source

@@ -11,8 +11,7 @@ from coliags_plugin.core.ply import point_properties, write_ply
 from coliags_plugin.datamanagers.c3vd_endogslam import OPTIMIZED, PARAMS, PREPARED_DEPTH, PREPARED_PINHOLE, SH0
 from coliags_plugin.geometry.lenses.models import PinholeLens
 from coliags_plugin.geometry.poses import endogslam
-from coliags_plugin.geometry.poses.rigid import inverse
-from coliags_plugin.geometry.poses.trajectory import Trajectory
+from coliags_plugin.geometry.poses.trajectory import Trajectory, inverse
 from coliags_plugin.phantom.layouts.base import Layout, part_folder
 from coliags_plugin.phantom.layouts.built_in import write_poses
 from coliags_plugin.phantom.trajectory import TEST_EVERY

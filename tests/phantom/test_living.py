@@ -12,8 +12,7 @@ import pytest
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.geometry.lenses.models import PinholeLens
-from coliags_plugin.geometry.meshes.files import read_mesh
-from coliags_plugin.geometry.meshes.mesh import TriangleMesh
+from coliags_plugin.geometry.meshes.mesh import TriangleMesh, read_mesh
 from coliags_plugin.phantom.colon import WAVE_LENGTH, WAVE_SPEED, breathing, peristalsis, wall_motion
 from coliags_plugin.phantom.generate import PreparedPhantom, generate, prepare
 from coliags_plugin.phantom.imaging import Sensor

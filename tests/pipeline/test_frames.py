@@ -35,7 +35,7 @@ from coliags_plugin.pipeline.frame_sources import chosen_frames, frame_source, i
 from coliags_plugin.pipeline.frames import read_blurred, read_lens_mask, write_frames
 from coliags_plugin.pipeline.settings import FrameSettings
 from coliags_plugin.pipeline.survey import FrameSurvey, survey_video
-from coliags_plugin.reconstruction.structure.texture import sharpness
+from coliags_plugin.reconstruction.structure.point_tracks import sharpness
 from coliags_plugin.reporting.video import write_video
 from tests.pipeline.films import HEIGHT, KNOWN, WIDTH, blurred, film, write_images
 

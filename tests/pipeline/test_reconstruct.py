@@ -20,7 +20,7 @@ from coliags_plugin.core.scene_files import read_unit
 from coliags_plugin.engine.data_formats import find_format
 from coliags_plugin.export.baking import distillation
 from coliags_plugin.geometry.lenses.models import LENSES
-from coliags_plugin.geometry.meshes.files import read_mesh
+from coliags_plugin.geometry.meshes.mesh import read_mesh
 from coliags_plugin.geometry.poses import colmap
 from coliags_plugin.geometry.poses.alignment import align, associate
 from coliags_plugin.geometry.poses.trajectory import Trajectory
@@ -109,7 +109,7 @@ def test_coverage_is_left_out_where_it_cannot_be_measured_but_not_where_it_canno
 ):
     scene = write_tube(tmp_path / "tube", 6, 3.0)
     monkeypatch.setattr(steps, "coverage", _COVERAGE)
-    monkeypatch.setattr("coliags_plugin.geometry.meshes.files.read_mesh", lambda path: None)
+    monkeypatch.setattr("coliags_plugin.geometry.meshes.mesh.read_mesh", lambda path: None)
 
     def failing(error):
         def measure_scene(*args, **options):

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import pycolmap
 import pytest
@@ -84,47 +82,29 @@ def test_the_lamp_chooses_between_a_model_and_its_reversal():
     assert choose(pair, NARROW).is_reversed
 
 
-@dataclass
-class Model:
-    """Numbers of a model that the choice uses."""
-
-    focal: float = 200.0
-    radial: float = 0.0
-    lens: str = "SIMPLE_RADIAL"
-    images: int = 20
-    observations: int = 1000
-    error: float = 0.5
-
-    @property
-    def cameras(self):
-        camera = pycolmap.Camera.create_from_model_name(1, self.lens, self.focal, 320, 240)
-        camera.params = [self.focal, 160.0, 120.0, self.radial]
-        return {1: camera}
-
-    def num_reg_images(self):
-        return self.images
-
-    def compute_num_observations(self):
-        return self.observations
-
-    def compute_mean_reprojection_error(self):
-        return self.error
+def hypothesis(
+    correlation=-0.7, focal=200.0, radial=0.0, lens="SIMPLE_RADIAL", images=20, observations=1000, error=0.5
+):
+    """A hypothesis by the numbers that the choice uses."""
+    camera = pycolmap.Camera.create_from_model_name(1, lens, focal, 320, 240)
+    camera.params = [focal, 160.0, 120.0, radial]
+    return Hypothesis(None, images, observations, error, camera, [field_of_view(camera)], correlation)
 
 
 def test_plausible_then_complete_then_lit_then_exact():
-    best = Hypothesis(Model(error=0.6), -0.7)
+    best = hypothesis(error=0.6)
     others = [
-        Hypothesis(Model(focal=1967.0, observations=2000, error=0.1), -0.9),
-        Hypothesis(Model(images=15, error=0.1), -0.9),
-        Hypothesis(Model(observations=500, error=0.1), -0.9),
-        Hypothesis(Model(error=0.1), 0.2),
-        Hypothesis(Model(error=0.1), None),
-        Hypothesis(Model(error=0.7), -0.9),
+        hypothesis(-0.9, focal=1967.0, observations=2000, error=0.1),
+        hypothesis(-0.9, images=15, error=0.1),
+        hypothesis(-0.9, observations=500, error=0.1),
+        hypothesis(0.2, error=0.1),
+        hypothesis(None, error=0.1),
+        hypothesis(-0.9, error=0.7),
     ]
     assert choose([*others, best], RANGE) is best
     # Where errors hardly differ, the first of the same camera model, whatever its distortion.
-    distorted = Hypothesis(Model(radial=-0.2, error=0.61), -0.7)
-    assert choose([best, Hypothesis(Model(focal=150.0, error=0.59), -0.7)], RANGE) is best
+    distorted = hypothesis(radial=-0.2, error=0.61)
+    assert choose([best, hypothesis(focal=150.0, error=0.59)], RANGE) is best
     assert choose([distorted, best], RANGE) is distorted
     with pytest.raises(InputError, match=r"1967 px \(9 degrees\).*nominal field of view of 40 to 150 degrees"):
         choose(others[:1], RANGE)
@@ -134,9 +114,9 @@ def test_the_least_distorted_of_camera_models_that_fit_as_well():
     """To third order, a fisheye with k and a pinhole with k - 1/3 are the same lens; their order does not matter."""
 
     def taken(third, error=0.5):
-        fisheye = Hypothesis(Model(radial=third, lens="SIMPLE_RADIAL_FISHEYE", error=error), -0.7)
-        pinhole = Hypothesis(Model(radial=third - 1 / 3, error=0.51), -0.7)
-        (model,) = {choose(pair, RANGE).camera_model for pair in ([fisheye, pinhole], [pinhole, fisheye])}
+        fisheye = hypothesis(radial=third, lens="SIMPLE_RADIAL_FISHEYE", error=error)
+        pinhole = hypothesis(radial=third - 1 / 3, error=0.51)
+        (model,) = {choose(pair, RANGE).camera.model_name for pair in ([fisheye, pinhole], [pinhole, fisheye])}
         return model
 
     assert taken(0.0) == taken(-0.1) == taken(0.1) == "SIMPLE_RADIAL_FISHEYE"
@@ -146,15 +126,15 @@ def test_the_least_distorted_of_camera_models_that_fit_as_well():
 
 
 def test_focal_lengths_that_fit_as_well():
-    chosen = Hypothesis(Model(), -0.7)
+    chosen = hypothesis()
     assert set(fitting_focal_lengths([chosen], chosen, RANGE)) == {200.0}
-    for model, correlation, fits in (
-        (Model(focal=260.0, error=0.51), -0.5, True),
-        (Model(focal=260.0, error=0.7), -0.5, False),
-        (Model(focal=260.0, error=0.51), 0.5, False),
-        (Model(focal=260.0, error=0.51, lens="SIMPLE_RADIAL_FISHEYE"), -0.7, True),
+    for rival, fits in (
+        (hypothesis(-0.5, focal=260.0, error=0.51), True),
+        (hypothesis(-0.5, focal=260.0, error=0.7), False),
+        (hypothesis(0.5, focal=260.0, error=0.51), False),
+        (hypothesis(focal=260.0, error=0.51, lens="SIMPLE_RADIAL_FISHEYE"), True),
     ):
-        lengths = fitting_focal_lengths([chosen, Hypothesis(model, correlation)], chosen, RANGE)
+        lengths = fitting_focal_lengths([chosen, rival], chosen, RANGE)
         assert set(lengths) == {200.0, *([260.0] if fits else [])}
 
 

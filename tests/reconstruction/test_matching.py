@@ -11,11 +11,22 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from coliags_plugin.reconstruction.structure.features import Features, FeatureSettings, highlights, usable
-from coliags_plugin.reconstruction.structure.matching import alike_pairs, epipolar_inliers, mutual_matches
-from coliags_plugin.reconstruction.structure.point_tracks import shared_tracks, track_between, track_points
-from coliags_plugin.reconstruction.structure.sfm_settings import SfmSettings, TrackSettings
-from coliags_plugin.reconstruction.structure.texture import fineness, wall_textures
+from coliags_plugin.reconstruction.structure.features import (
+    Features,
+    alike_pairs,
+    epipolar_inliers,
+    highlights,
+    mutual_matches,
+    usable,
+)
+from coliags_plugin.reconstruction.structure.point_tracks import (
+    fineness,
+    shared_tracks,
+    track_between,
+    track_points,
+    wall_textures,
+)
+from coliags_plugin.reconstruction.structure.sfm_settings import FeatureSettings, SfmSettings, TrackSettings
 from coliags_plugin.reconstruction.structure.video import MatchedVideo, cut_where_lost
 from coliags_plugin.reporting.image_files import write_png
 from tests.textured_tube import HEIGHT, INTRINSICS, WIDTH, texture, tube_frames

@@ -18,8 +18,7 @@ from coliags_plugin.core.images import read_rgb, write_image
 from coliags_plugin.engine.data_formats import open_scene
 from coliags_plugin.geometry.poses import colmap
 from coliags_plugin.geometry.poses.alignment import align, associate
-from coliags_plugin.geometry.poses.rigid import rigid
-from coliags_plugin.geometry.poses.trajectory import Trajectory
+from coliags_plugin.geometry.poses.trajectory import Trajectory, rigid
 from coliags_plugin.phantom.generate import generate
 from coliags_plugin.phantom.settings import PhantomSettings
 from coliags_plugin.reconstruction.structure.colmap_scene import write_sfm_scene

@@ -14,10 +14,17 @@ from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.jobs import Progress, with_progress
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.core.tensors import bilinear
-from coliags_plugin.geometry.poses.rigid import w_first
-from coliags_plugin.reconstruction.structure.features import FeatureSettings, feature_extractor, quiet_colmap
-from coliags_plugin.reconstruction.structure.matching import Pose, have_positive_depths, mutual_matches, rays
+from coliags_plugin.geometry.poses.trajectory import w_first
+from coliags_plugin.reconstruction.structure.features import (
+    Pose,
+    feature_extractor,
+    have_positive_depths,
+    mutual_matches,
+    quiet_colmap,
+    rays,
+)
 from coliags_plugin.reconstruction.structure.point_tracks import track_between
+from coliags_plugin.reconstruction.structure.sfm_settings import FeatureSettings
 
 Change = Callable[[Float[Tensor, "4 4"]], Float[Tensor, "4 4"]]
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from coliags_plugin.core.files import atomic_write
 from coliags_plugin.export.splats.cloud import SplatCloud
-from coliags_plugin.geometry.meshes.files import linear_light
+from coliags_plugin.geometry.meshes.mesh import linear_light
 
 EXTENSION = "KHR_gaussian_splatting"
 #: glTF's numbers of a primitive of points, of float32 and of a buffer of vertices, and its shapes by their channels.

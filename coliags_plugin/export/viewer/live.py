@@ -36,7 +36,7 @@ from coliags_plugin.engine.rendering import depth_picture, render_view, sampled_
 from coliags_plugin.engine.trained import TrainedRun, load_newer
 from coliags_plugin.engine.trainer import Trainer
 from coliags_plugin.export.viewer.page import look_distance, mesh_files
-from coliags_plugin.geometry.meshes.files import encode_mesh, read_mesh
+from coliags_plugin.geometry.meshes.mesh import encode_mesh, read_mesh
 from coliags_plugin.reporting.image_files import as_array, eight_bit
 
 logger = logging.getLogger(__name__)

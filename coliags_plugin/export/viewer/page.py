@@ -34,8 +34,7 @@ from coliags_plugin.export.baking.exporting import cost_lines, export_cost, ligh
 from coliags_plugin.export.splats import spz
 from coliags_plugin.export.splats.cloud import SplatCloud, field_of_cloud
 from coliags_plugin.fields.explicit_gaussians import FARTHEST
-from coliags_plugin.geometry.meshes.files import read_mesh
-from coliags_plugin.geometry.meshes.mesh import TriangleMesh
+from coliags_plugin.geometry.meshes.mesh import TriangleMesh, read_mesh
 from coliags_plugin.renderers.splatting import SplattingRenderer
 from coliags_plugin.reporting.html_page import environment, refuse_folder
 from coliags_plugin.reporting.image_files import EncodedImage

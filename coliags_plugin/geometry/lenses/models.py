@@ -201,8 +201,11 @@ class OmnidirectionalLens(CalibratedLens):
 
     @property
     def _rim(self) -> float:
-        """The radius seen at 90 degrees."""
-        return _first_root([self.a0, 0.0, self.a2, self.a3, self.a4])
+        """The radius seen at 90 degrees, infinite where there is none."""
+        terms = np.polynomial.polyutils.trimcoef([self.a0, 0.0, self.a2, self.a3, self.a4], _NEGLIGIBLE)
+        roots = np.polynomial.Polynomial(terms).roots()
+        positive = roots.real[(np.abs(roots.imag) < 1e-9 * (1.0 + np.abs(roots.real))) & (roots.real > 0.0)]
+        return float(positive.min(initial=np.inf))
 
     def _tangents(self, pixels: Array) -> Array:
         q = (pixels - (self.cx, self.cy)) @ np.linalg.inv(self._affine).T
@@ -277,7 +280,10 @@ class MappedLens(CalibratedLens):
             if not len(going):
                 break
             before = angles[going]
-            angles[going] = self._kept_inside(before - _solved(self._jacobian(before), miss))
+            after = before - _solved(self._jacobian(before), miss)
+            length, reach = np.linalg.norm(after, axis=1), self._reach(after)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                angles[going] = after * np.where(length > reach, reach / length, 1.0)[:, None]
             # What no direction shows ends at the rim and stays there.
             going = going[np.abs(angles[going] - before).max(axis=1) > 1e-15]
         is_reached = np.linalg.norm(self._at(angles) - target, axis=1) < _TOLERANCE
@@ -299,11 +305,6 @@ class MappedLens(CalibratedLens):
         """The limit in the direction of each vector. [N]"""
         clock = np.arctan2(angles[:, 1], angles[:, 0])
         return np.interp(clock, _CLOCK, _limits(self), period=2.0 * np.pi)
-
-    def _kept_inside(self, angles: Array) -> Array:
-        length, reach = np.linalg.norm(angles, axis=1), self._reach(angles)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            return np.asarray(angles * np.where(length > reach, reach / length, 1.0)[:, None])
 
     def _at(self, angles: Array) -> Array:
         return self._bent(_directions(angles))
@@ -443,21 +444,11 @@ def along(direction: Array, length: Array, new_length: Array, ratio_at_zero: flo
     return direction * ratio[:, None]
 
 
-def _first_root(coefficients: list[float]) -> float:
-    """The smallest positive real root of a polynomial, constant term first; infinite where there is none."""
-    terms = np.polynomial.polyutils.trimcoef(coefficients, _NEGLIGIBLE)
-    roots = np.polynomial.Polynomial(terms).roots()
-    positive = roots.real[(np.abs(roots.imag) < 1e-9 * (1.0 + np.abs(roots.real))) & (roots.real > 0.0)]
-    return float(positive.min(initial=np.inf))
-
-
-def _solve_increasing(
-    function: Callable[[Array], Array], slope: Callable[[Array], Array], upper: Array, iterations: int = 60
-) -> Array:
+def _solve_increasing(function: Callable[[Array], Array], slope: Callable[[Array], Array], upper: Array) -> Array:
     """Roots in [0, upper] of increasing functions, one each, by Newton's method kept inside a bracket; NaN stays."""
     low, high = np.zeros_like(upper), upper.copy()
     root = 0.5 * upper
-    for _ in range(iterations):
+    for _ in range(60):
         value = function(root)
         low, high = np.where(value < 0.0, root, low), np.where(value >= 0.0, root, high)
         with np.errstate(divide="ignore", invalid="ignore"):

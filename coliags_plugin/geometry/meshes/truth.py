@@ -11,8 +11,7 @@ from jaxtyping import Bool, Float, Int
 
 from coliags_plugin.core.arrays import read_arrays
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.geometry.meshes.files import read_flagged_mesh
-from coliags_plugin.geometry.meshes.mesh import TriangleMesh
+from coliags_plugin.geometry.meshes.mesh import TriangleMesh, read_flagged_mesh
 
 #: Where the truth of a scene lies in its folder: of phantoms, and C3VD's.
 _PLACES = ("truth/mesh.ply", "coverage_mesh.obj")

@@ -17,8 +17,7 @@ from jaxtyping import Float, Int
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.geometry.poses.endogslam import image_indices
-from coliags_plugin.geometry.poses.rigid import inverse, rigid, rotation_angles_deg
-from coliags_plugin.geometry.poses.trajectory import Trajectory
+from coliags_plugin.geometry.poses.trajectory import Trajectory, inverse, rigid, rotation_angles_deg
 
 Match = Literal["auto", "name", "time", "index", "endogslam-train"]
 
@@ -101,7 +100,7 @@ _NO_PAIRS = np.empty((0, 2), np.int64)
 def _by_name(first: Trajectory, second: Trajectory, tolerance: float) -> _Pairs:
     if first.names is None or second.names is None:
         return _NO_PAIRS, "not both have names"
-    for of in (str, _stem):
+    for of in (str, lambda name: PurePosixPath(name.replace("\\", "/")).stem):
         names, others = [of(name) for name in first.names], [of(name) for name in second.names]
         common = set(names) & set(others)
         repeated = [name for counts in (Counter(names), Counter(others)) for name in common if counts[name] > 1]
@@ -141,10 +140,6 @@ def _by_training_frame(first: Trajectory, second: Trajectory, tolerance: float) 
 
 
 _ASSOCIATIONS = {"name": _by_name, "time": _by_time, "index": _by_index, "endogslam-train": _by_training_frame}
-
-
-def _stem(name: str) -> str:
-    return PurePosixPath(name.replace("\\", "/")).stem
 
 
 @dataclass(frozen=True, eq=False)

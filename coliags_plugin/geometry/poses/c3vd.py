@@ -12,8 +12,7 @@ from jaxtyping import Float
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_write
 from coliags_plugin.geometry.poses.formats import Format, count_first_numbers, read_numbers
-from coliags_plugin.geometry.poses.rigid import RIGID_TOLERANCE, check_rigid
-from coliags_plugin.geometry.poses.trajectory import Trajectory
+from coliags_plugin.geometry.poses.trajectory import RIGID_TOLERANCE, Trajectory, check_rigid
 
 
 @dataclass(frozen=True)

@@ -26,8 +26,15 @@ from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.core.json_files import JsonObject
 from coliags_plugin.core.text_files import shortened, text_lines, unreadable
 from coliags_plugin.geometry.poses.formats import EXPECTED, Format, prefixed_errors
-from coliags_plugin.geometry.poses.rigid import inverse, rigid, rotations_from_wxyz, wxyz_from_rotations
-from coliags_plugin.geometry.poses.trajectory import Trajectory, natural_order, refuse_repeated
+from coliags_plugin.geometry.poses.trajectory import (
+    Trajectory,
+    inverse,
+    natural_order,
+    refuse_repeated,
+    rigid,
+    rotations_from_wxyz,
+    wxyz_from_rotations,
+)
 
 if TYPE_CHECKING:
     import pycolmap

@@ -17,8 +17,14 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import write_arrays
 from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.geometry.poses.formats import Format, head, prefixed_errors
-from coliags_plugin.geometry.poses.rigid import check_rigid, inverse, rigid, rotations_from_wxyz, wxyz_from_rotations
-from coliags_plugin.geometry.poses.trajectory import Trajectory
+from coliags_plugin.geometry.poses.trajectory import (
+    Trajectory,
+    check_rigid,
+    inverse,
+    rigid,
+    rotations_from_wxyz,
+    wxyz_from_rotations,
+)
 
 #: Key -> shape, of at least one dimension; a letter is the same size throughout the file, F the number of poses.
 SHAPES: dict[str, tuple[int | str, ...]] = {

@@ -17,8 +17,13 @@ from coliags_plugin.core.files import write_json
 from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.core.json_files import JsonObject, read_json, read_number
 from coliags_plugin.geometry.poses.formats import Format, head_text, prefixed_errors
-from coliags_plugin.geometry.poses.rigid import FLIP_Y_AND_Z, check_rigid
-from coliags_plugin.geometry.poses.trajectory import Trajectory, natural_order, refuse_repeated
+from coliags_plugin.geometry.poses.trajectory import (
+    FLIP_Y_AND_Z,
+    Trajectory,
+    check_rigid,
+    natural_order,
+    refuse_repeated,
+)
 
 _PINHOLE = ("fl_x", "fl_y", "cx", "cy", "w", "h")
 _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")

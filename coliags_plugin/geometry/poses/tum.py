@@ -12,8 +12,13 @@ from scipy.spatial.transform import Rotation
 
 from coliags_plugin.core.files import atomic_write
 from coliags_plugin.geometry.poses.formats import Format, count_first_numbers, head_text, read_numbers
-from coliags_plugin.geometry.poses.rigid import ZERO_QUATERNION, rigid, rotations_from_wxyz, wxyz_from_rotations
-from coliags_plugin.geometry.poses.trajectory import Trajectory
+from coliags_plugin.geometry.poses.trajectory import (
+    ZERO_QUATERNION,
+    Trajectory,
+    rigid,
+    rotations_from_wxyz,
+    wxyz_from_rotations,
+)
 
 log = logging.getLogger(__name__)
 

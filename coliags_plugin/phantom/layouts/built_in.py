@@ -16,8 +16,7 @@ from coliags_plugin.geometry.lenses.models import Lens, OpenCVLens
 from coliags_plugin.geometry.poses import tum
 from coliags_plugin.geometry.poses.c3vd import matrix_lines
 from coliags_plugin.geometry.poses.colmap import colmap_poses, posed_model, write_reconstruction
-from coliags_plugin.geometry.poses.rigid import FLIP_Y_AND_Z, inverse
-from coliags_plugin.geometry.poses.trajectory import Trajectory
+from coliags_plugin.geometry.poses.trajectory import FLIP_Y_AND_Z, Trajectory, inverse
 from coliags_plugin.phantom.layouts.base import Layout, Part, PhantomFrame, WallPoints, part_folder
 
 if TYPE_CHECKING:

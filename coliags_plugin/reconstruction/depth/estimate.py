@@ -2,22 +2,28 @@
 
 from __future__ import annotations
 
+import json
 import logging
-from collections.abc import Callable, Iterator, Sequence
+import shutil
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
+from coliags_plugin.core.arrays import read_arrays
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.files import atomic_write, make_folder, write_arrays, write_json
 from coliags_plugin.core.images import sizes_text
-from coliags_plugin.core.jobs import Progress
+from coliags_plugin.core.jobs import Progress, locked
 from coliags_plugin.core.scene_files import parallel_map
 from coliags_plugin.core.scenes import Frame
-from coliags_plugin.reconstruction.depth.depth_range import DepthRange
 from coliags_plugin.reconstruction.depth.priors import (
+    DepthRange,
     FilePrior,
     LightPrior,
     complete,
@@ -43,9 +49,65 @@ from coliags_plugin.reconstruction.depth.sweeping import (
     sweep_frame,
     sweep_weight,
 )
-from coliags_plugin.reconstruction.depth.work_files import Arrays, WorkFolder
 
 log = logging.getLogger(__name__)
+
+Arrays = Mapping[str, np.ndarray]
+#: What describes the estimation, in the folder of its work files.
+_REQUEST = "request.json"
+
+
+@dataclass(frozen=True)
+class WorkFolder:
+    """The folder of an estimation's work files: one folder for each pass, one file in it for each frame."""
+
+    path: Path
+
+    def file(self, stage: str, index: int) -> Path:
+        """The file of a frame of a pass."""
+        return self.path / stage / f"{index:06d}.npz"
+
+    def save(self, stage: str, index: int, arrays: Arrays) -> None:
+        """Keep the results of a frame of a pass; atomic."""
+        write_arrays(self.file(stage, index), arrays)
+
+    def load(self, stage: str, index: int) -> dict[str, np.ndarray]:
+        """The results of a frame of a pass."""
+        return read_arrays(self.file(stage, index), "a work file of this estimation", optional=None)
+
+    def value(self, name: str, make: Callable[[], Any]) -> Any:
+        """A JSON value: the kept one, or else a new one, which is kept."""
+        file = self.path / f"{name}.json"
+        if not file.is_file():
+            write_json(file, make())
+        return json.loads(file.read_text())
+
+
+@contextmanager
+def work_folder(out: Path, request: Mapping[str, Any]) -> Iterator[WorkFolder]:
+    """The work files for an output folder, beside it; removed when the block ends without an error.
+
+    ``request`` is everything that determines the results, as JSON values; work files of another one are removed first.
+    """
+    path = out.parent / f".{out.name}.work"
+    make_folder(path)
+    with locked(path / "lock", out):
+        file, described = path / _REQUEST, json.loads(json.dumps(dict(request)))
+        stored = json.loads(file.read_text()) if file.is_file() else None
+        if stored is not None and stored != described:
+            log.warning("%s: work files of other data or options are removed", path)
+        if stored != described:
+            for old in path.iterdir():
+                if old.is_dir():
+                    shutil.rmtree(old)
+                elif old.name != "lock":
+                    old.unlink()
+            write_json(file, described)
+        else:
+            log.info("resuming from the work files in %s", path)
+        yield WorkFolder(path)
+    shutil.rmtree(path, ignore_errors=True)
+
 
 #: Fewest neighbours that a frame's depth is trusted with, and fewest frames that can have as many.
 FEWEST_NEIGHBOURS = 3
@@ -83,9 +145,22 @@ class Estimation:
 
     def run(self) -> None:
         """Run all passes that are not done."""
-        with _one_thread_of_opencv():
+        import cv2
+
+        # On one thread, as the last bits of OpenCV's global smoother depend on how it splits an image.
+        threads = cv2.getNumThreads()
+        cv2.setNumThreads(1)
+        try:
             for number, sweep in enumerate(SWEEPS):
-                self._pass(number, sweep)
+                neighbours = self._neighbours(number, sweep)
+                self._sweep(number, sweep, neighbours)
+                self._fuse(number, sweep, neighbours)
+                self.medians = self.work.value(
+                    f"medians-{number}",
+                    lambda: [float(np.median(self.result(index)[0])) for index in range(len(self.frames))],
+                )
+        finally:
+            cv2.setNumThreads(threads)
 
     def result(self, index: int) -> tuple[Map, Map, str]:
         """A frame's z-depth, scene units, and the probability that it is off by less than 5 %, 0 by a prior alone.
@@ -94,12 +169,6 @@ class Estimation:
         """
         arrays = self.work.load(self.last, index)
         return arrays["depth"], arrays["confidence"], str(arrays["distrust"])
-
-    def _pass(self, number: int, sweep: Sweep) -> None:
-        neighbours = self._neighbours(number, sweep)
-        self._sweep(number, sweep, neighbours)
-        self._fuse(number, sweep, neighbours)
-        self.medians = self.work.value(f"medians-{number}", self._medians)
 
     def _neighbours(self, number: int, sweep: Sweep) -> list[list[int]]:
         centers = _camera_centers(self.frames)
@@ -184,29 +253,16 @@ class Estimation:
 
     def _stage(self, stage: str, function: Callable[[int], Arrays], title: str) -> None:
         def one(index: int) -> None:
-            if not self.work.has(stage, index):
+            if not self.work.file(stage, index).is_file():
                 self.work.save(stage, index, function(index))
 
-        if not self.work.is_done(stage):
+        done = self.work.path / f"{stage}.done"
+        if not done.is_file():
             parallel_map(one, range(len(self.frames)), title, self.progress, self.jobs)
-            self.work.finish(stage, self.last or None)
+            atomic_write(done, "")
+            if self.last:  # this stage was made from it
+                shutil.rmtree(self.work.path / self.last, ignore_errors=True)
         self.last = stage
-
-    def _medians(self) -> list[float]:
-        return [float(np.median(self.result(index)[0])) for index in range(len(self.frames))]
-
-
-@contextmanager
-def _one_thread_of_opencv() -> Iterator[None]:
-    """Keep OpenCV to the calling thread: the last bits of its global smoother depend on how it splits an image."""
-    import cv2
-
-    before = cv2.getNumThreads()
-    cv2.setNumThreads(1)
-    try:
-        yield
-    finally:
-        cv2.setNumThreads(before)
 
 
 def check_video(frames: Sequence[Frame], sources: Sequence[int]) -> None:

@@ -20,13 +20,10 @@ from coliags_plugin.core.scenes import Frame, Scene
 from coliags_plugin.core.splits import split_options
 from coliags_plugin.datamanagers.nerfstudio import EstimatedSceneWriter
 from coliags_plugin.datamanagers.shots import PAPER_SIZE, fitted
-from coliags_plugin.reconstruction.depth.depth_range import DepthRange, find_range, given_range
-from coliags_plugin.reconstruction.depth.estimate import Estimation, check_video
-from coliags_plugin.reconstruction.depth.priors import FilePrior, LightPrior
+from coliags_plugin.reconstruction.depth.estimate import Estimation, WorkFolder, check_video, work_folder
+from coliags_plugin.reconstruction.depth.priors import DepthRange, FilePrior, LightPrior, find_range, given_range
 from coliags_plugin.reconstruction.depth.sweeping import DepthEstimationSettings, Map, Mask
-from coliags_plugin.reconstruction.depth.work_files import WorkFolder, work_folder
-from coliags_plugin.reconstruction.structure.features import image_and_mask
-from coliags_plugin.reconstruction.structure.matching import Pose
+from coliags_plugin.reconstruction.structure.features import Pose, image_and_mask
 
 log = logging.getLogger(__name__)
 

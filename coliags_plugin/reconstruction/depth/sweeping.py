@@ -13,8 +13,8 @@ from pydantic import Field
 
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.core.settings import Settings
-from coliags_plugin.reconstruction.structure.features import FeatureSettings, image_and_mask, usable
-from coliags_plugin.reconstruction.structure.matching import Pose
+from coliags_plugin.reconstruction.structure.features import Pose, image_and_mask, usable
+from coliags_plugin.reconstruction.structure.sfm_settings import FeatureSettings
 
 
 class Sweep(NamedTuple):

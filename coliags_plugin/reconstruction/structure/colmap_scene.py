@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import shutil
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import UInt8
 
 from coliags_plugin.core.files import atomic_folder, link_or_copy, write_json
 from coliags_plugin.core.images import decode_image, read_8_bit, write_image, write_mask
@@ -18,11 +16,6 @@ from coliags_plugin.datamanagers.colmap import ATLAS_FILE
 from coliags_plugin.geometry.poses.colmap import write_reconstruction
 from coliags_plugin.reconstruction.structure.image_files import Masks, mask_of
 from coliags_plugin.reconstruction.structure.sfm import Atlas
-from coliags_plugin.reporting.colormaps import INK, draw_text
-from coliags_plugin.reporting.image_files import write_png
-
-#: Name of the picture of the sub-maps.
-RIBBON_FILE = "atlas.png"
 
 
 def write_sfm_scene(
@@ -35,9 +28,9 @@ def write_sfm_scene(
 ) -> None:
     """Write a scene in COLMAP's layout: the posed images as 8-bit RGB, masks, the unit, and the models, largest first.
 
-    ``atlas.json`` tells which images each model has, how good it is, and why the other images have no pose;
-    ``atlas.png`` shows it. ``units`` are those of the models, unknown where not given: each has then one of its own.
-    With ``link``, images are second names of the given files, where the disk allows it, and take no space.
+    ``atlas.json`` tells which images each model has, how good it is, and why the other images have no pose. ``units``
+    are those of the models, unknown where not given: each has then one of its own. With ``link``, images are second
+    names of the given files, where the disk allows it, and take no space.
     """
     unknown: list[Unit] = ["unknown"] * (len(atlas.models) - len(units))
     units, copy = [*units, *unknown], link_or_copy if link else _copy_as_8_bit
@@ -52,7 +45,6 @@ def write_sfm_scene(
             write_reconstruction(scratch / "sparse" / str(number), reconstruction.model)
         write_unit(scratch, units[0])
         write_json(scratch / ATLAS_FILE, _record(atlas, units))
-        write_png(scratch / RIBBON_FILE, draw_ribbon(atlas))
 
 
 def _copy_as_8_bit(source: Path, target: Path) -> None:
@@ -99,35 +91,3 @@ def _record(atlas: Atlas, units: Sequence[Unit]) -> dict[str, object]:
         ],
         "lost": [{"frame": index, "reason": reason} for index, reason in atlas.lost.items()],
     }
-
-
-#: Width of the picture, and first and last column and row of the ribbon in it; height of a line of text. Pixels.
-_WIDTH, _LEFT, _RIGHT, _TOP, _BOTTOM, _LINE = 1200, 20, 1180, 60, 120, 22
-#: Colours of models, distinguishable with any colour vision (Okabe and Ito), paler for every further six; and greys.
-_MODELS = ((86, 180, 233), (230, 159, 0), (0, 158, 115), (204, 121, 167), (240, 228, 66), (0, 114, 178))
-_LOST = ((70, 70, 70), (130, 130, 130), (185, 185, 185))
-
-
-def draw_ribbon(atlas: Atlas) -> UInt8[np.ndarray, "H 1200 3"]:
-    """Draw the frames from left to right: colours are models, greys frames without a pose, a notch a weak place."""
-    count, reasons = len(atlas.images), Counter(atlas.lost.values())
-    greys = {reason: _LOST[min(row, len(_LOST) - 1)] for row, reason in enumerate(reasons)}
-    colors = np.full((count, 3), 255, np.uint8)
-    for number, model in enumerate(atlas.models):
-        strength = 0.5 ** (number // len(_MODELS))
-        colors[list(model.registered)] = np.rint(255 - strength * (255 - np.array(_MODELS[number % len(_MODELS)])))
-    for frame, reason in atlas.lost.items():
-        colors[frame] = greys[reason]
-    image = np.full((_BOTTOM + _LINE * (1 + len(reasons)), _WIDTH, 3), 255, np.uint8)
-    image[_TOP:_BOTTOM, _LEFT:_RIGHT] = colors[np.arange(_RIGHT - _LEFT) * count // (_RIGHT - _LEFT)]
-    for link in (link for model in atlas.models for link in model.links):
-        column = _LEFT + (link.after + 1) * (_RIGHT - _LEFT) // count
-        image[_TOP : _TOP + 12, column - 1 : column + 1] = INK
-    posed = count - len(atlas.lost)
-    title = f"{posed} of {count} frames posed ({100.0 * posed / count:.0f} %), {len(atlas.models)} models"
-    draw_text(image, title, (_LEFT, 28), 0.6)
-    for row, (reason, frames) in enumerate(reasons.items(), start=1):
-        bottom = _BOTTOM + _LINE * row
-        image[bottom - 10 : bottom + 2, _LEFT : _LEFT + 12] = greys[reason]
-        draw_text(image, f"{frames} frames without a pose: {reason}", (_LEFT + 20, bottom))
-    return image

@@ -1,50 +1,24 @@
-"""SIFT features of endoscopic images, with local contrast enhancement and specular highlights masked."""
+"""SIFT features of endoscopic images, without specular highlights, and their matches between pairs of images."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, UInt8
-from pydantic import Field
+from jaxtyping import Bool, Float, Float32, UInt8, UInt32
+from scipy.sparse import coo_array
+from scipy.spatial import cKDTree
 
 from coliags_plugin.core.arrays import dilated
+from coliags_plugin.core.cameras import Camera
+from coliags_plugin.core.intrinsics import Intrinsics
+from coliags_plugin.core.jobs import Progress, with_progress
 from coliags_plugin.core.scenes import Frame
-from coliags_plugin.core.settings import Settings
-
-
-class FeatureSettings(Settings):
-    """Options of SIFT extraction. COLMAP's defaults find about a hundred points on a colon's wall."""
-
-    local_contrast: float = Field(
-        default=4.0,
-        ge=0.0,
-        description="Clip limit of CLAHE (contrast-limited adaptive histogram equalisation) of the grey image, on "
-        "8 x 8 tiles; 0: none.",
-    )
-    peak_threshold: float = Field(
-        default=0.001, gt=0.0, description="SIFT peak (contrast) threshold. COLMAP's default is 0.0067."
-    )
-    max_features: int = Field(
-        default=4000, ge=1, description="Largest number of features per image; those of the largest scale are kept."
-    )
-    upright: bool = Field(
-        default=True,
-        description="Upright SIFT, without orientation: more features match, as long as the camera rolls by less than "
-        "about 20 degrees between matched images.",
-    )
-    highlight_level: int = Field(
-        default=250, ge=1, le=256, description="Brightness (of 255) from which a pixel is a highlight; 256: none is."
-    )
-    highlight_ratio: float = Field(
-        default=1.5,
-        gt=1.0,
-        description="A pixel this many times as bright as its surroundings, and brighter by at least 20 of 255, is "
-        "also a highlight; highlights move with the light source.",
-    )
-    margin: int = Field(default=3, ge=0, description="Dilation of highlights and masks, pixels.")
+from coliags_plugin.geometry.lenses.models import PinholeLens
+from coliags_plugin.reconstruction.structure.sfm_settings import FeatureSettings, SfmSettings
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,3 +118,169 @@ def quiet_colmap(seed: int) -> Iterator[None]:
         yield
     finally:
         pycolmap.logging.minloglevel = level
+
+
+#: Indices of the features that match in two images; and of all pairs of images that were compared.
+Pairs = UInt32[np.ndarray, "M 2"]
+Matches = Mapping[tuple[int, int], Pairs]
+
+#: Features closer than this are duplicates and do not count as the second-best match of each other. Pixels.
+_DUPLICATE_DISTANCE = 2.0
+
+
+def mutual_matches(first: Features, second: Features, max_ratio: float, max_distance: float) -> Pairs:
+    """Match features by mutual nearest descriptors, Lowe's ratio test and a limit of their distance, 0 to 2."""
+    if min(len(first), len(second)) < 2:
+        return np.empty((0, 2), np.uint32)
+    similarity = first.descriptors @ second.descriptors.T
+    nearest = similarity.argmax(axis=1)
+    best = similarity[np.arange(len(first)), nearest]
+    mutual = best == similarity.max(axis=0)[nearest]
+    # The most similar of each partner, the first of equals.
+    rows = np.flatnonzero(mutual)
+    rows = rows[np.lexsort((-best[rows], nearest[rows]))]
+    rows = np.sort(rows[np.unique(nearest[rows], return_index=True)[1]])
+    partners, similarity, best = nearest[rows], similarity[rows], best[rows]
+    # Duplicates of the best match, from neighbouring octaves, are excluded from the second-best.
+    duplicates = cKDTree(second.keypoints[:, :2]).query_pairs(_DUPLICATE_DISTANCE, output_type="ndarray").T
+    is_duplicate = coo_array((np.ones(duplicates.shape[1], bool), duplicates), shape=(len(second), len(second))).tocsr()
+    similarity[np.arange(len(rows)), partners] = -1.0
+    similarity[(is_duplicate + is_duplicate.T)[partners].nonzero()] = -1.0
+    products = best, similarity.max(axis=1, initial=-1.0)
+    distance, second_best = (np.sqrt(np.maximum(2.0 - 2.0 * product, 0.0)) for product in products)
+    is_match = (distance < max_distance) & (distance < max_ratio * second_best)
+    return np.stack([rows[is_match], partners[is_match]], axis=1).astype(np.uint32)
+
+
+@dataclass(frozen=True, eq=False)
+class Pose:
+    """Intrinsics and rigid pose of a view in float64."""
+
+    intrinsics: Intrinsics
+    camera_to_world: Float[np.ndarray, "4 4"]
+
+    @classmethod
+    def of(cls, camera: Camera, size: tuple[int, int] | None = None) -> Pose:
+        """Pose of a camera, with intrinsics for an image of another width and height if they are given."""
+        intrinsics = camera.intrinsics if size is None else camera.intrinsics.resized(*size)
+        return cls(intrinsics, camera.camera_to_world.cpu().double().numpy())
+
+    @property
+    def matrix(self) -> Float[np.ndarray, "3 3"]:
+        """K for pixel centres at integers + 0.5."""
+        k = self.intrinsics
+        return np.array([[k.fx, 0.0, k.cx], [0.0, k.fy, k.cy], [0.0, 0.0, 1.0]])
+
+    def rays(self) -> Float[np.ndarray, "H W 3"]:
+        """Directions through the pixel centres in the camera's axes, z = 1."""
+        k = self.intrinsics
+        x = (np.arange(k.width) + 0.5 - k.cx) / k.fx
+        y = (np.arange(k.height) + 0.5 - k.cy) / k.fy
+        return np.stack([*np.meshgrid(x, y), np.ones((k.height, k.width))], axis=-1)
+
+    def to(self, other: Pose) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]:
+        """Rotation and translation from this camera's axes to another's."""
+        turn = other.camera_to_world[:3, :3].T
+        return turn @ self.camera_to_world[:3, :3], turn @ (self.camera_to_world[:3, 3] - other.camera_to_world[:3, 3])
+
+    def homography(self, other: Pose) -> tuple[Float32[np.ndarray, "3 3"], Float32[np.ndarray, "3"]]:
+        """A and b that map pixel p at z-depth z to the homogeneous pixel A (p, 1) z + b of another view."""
+        rotation, translation = self.to(other)
+        turn = other.matrix @ rotation @ np.linalg.inv(self.matrix)
+        return turn.astype(np.float32), (other.matrix @ translation).astype(np.float32)
+
+    def depth_from(self, other: Pose) -> tuple[Float32[np.ndarray, "3"], np.float32]:
+        """Vector a and number b that map pixel p of another view at z-depth z to z-depth a . (p, 1) z + b here."""
+        rotation, translation = other.to(self)
+        return (rotation[2] @ np.linalg.inv(other.matrix)).astype(np.float32), np.float32(translation[2])
+
+
+def rays(pixels: Float[np.ndarray, "N 2"], camera: Camera) -> Float[np.ndarray, "N 3"]:
+    """Ray directions of pixels in the camera frame, z = 1. [N, 3]"""
+    return PinholeLens.of(camera.intrinsics).unproject(pixels)
+
+
+def have_positive_depths(turned: np.ndarray, other: np.ndarray, translation: np.ndarray) -> np.ndarray:
+    """True where the lines ``a * turned + translation`` and ``b * other`` are closest at positive a and b. [K]"""
+    aa, bb, ab = (np.einsum("ij,ij->i", *pair) for pair in ((turned, turned), (other, other), (turned, other)))
+    at, bt = turned @ translation, other @ translation
+    # The common denominator aa * bb - ab^2 is not negative.
+    return np.asarray((ab * bt - bb * at > 0.0) & (aa * bt - ab * at > 0.0))
+
+
+#: Focal length relative to the larger side of the fisheye that stands for an unknown endoscope: between neighbouring
+#: frames its error hardly matters.
+_TYPICAL_FOCAL_FACTOR = 0.6
+#: Fewest matches for an epipolar geometry.
+_FEWEST_MATCHES = 20
+
+
+def epipolar_inliers(
+    first: Float[np.ndarray, "K 2"], second: Float[np.ndarray, "K 2"], shape: tuple[int, ...], max_error: float
+) -> Bool[np.ndarray, "K"]:
+    """True for inliers of an essential matrix with a typical endoscope's camera; none of fewer than 20 matches. [K]
+
+    Args:
+        first: Column and row, pixel centres at integers.
+        second: The same points in the other image.
+        shape: Height and width of both images.
+        max_error: RANSAC inlier threshold, pixels.
+    """
+    import pycolmap
+
+    inliers = np.zeros(len(first), bool)
+    if len(first) < _FEWEST_MATCHES:
+        return inliers
+    height, width = shape[:2]
+    camera = pycolmap.Camera.create_from_model_name(
+        0, "SIMPLE_RADIAL_FISHEYE", _TYPICAL_FOCAL_FACTOR * max(width, height), width, height
+    )
+    options = pycolmap.TwoViewGeometryOptions()
+    options.ransac.max_error, options.ransac.random_seed = max_error, 0
+    matches = np.repeat(np.arange(len(first), dtype=np.uint32)[:, None], 2, axis=1)
+    pixels_first, pixels_second = (np.asarray(pixels, np.float64) + 0.5 for pixels in (first, second))
+    geometry = pycolmap.estimate_calibrated_two_view_geometry(
+        camera, pixels_first, camera, pixels_second, matches, options
+    )
+    inliers[np.asarray(geometry.inlier_matches, np.int64).reshape(-1, 2)[:, 0]] = True
+    return inliers
+
+
+#: Features of an image that are compared first, those of the largest scale.
+_LARGEST = 300
+#: Images of the video that are compared with each other for loop closures, at most; and loop closures of each.
+_LOOP_IMAGES, _LOOPS = 40, 2
+
+
+def alike_pairs(
+    features: Sequence[Features], settings: SfmSettings, progress: Progress | None = None
+) -> list[tuple[int, int]]:
+    """Pairs of images to match: all of a short video; else neighbours, and others whose largest features match.
+
+    Each image is paired with the next two; with those 4, 8, 16, ... images ahead, up to the first that is not alike
+    (every second or fourth image has the same pairs, therefore); and images evenly distributed over the video with the
+    two most alike of each other's that are not reached this way, as loop closures.
+    """
+    count = len(features)
+    if count <= settings.exhaustive_up_to:
+        return list(combinations(range(count), 2))
+    rows = [np.sort(np.argsort(-each.keypoints[:, 2], kind="stable")[:_LARGEST]) for each in features]
+    largest = [Features(each.keypoints[row], each.descriptors[row]) for each, row in zip(features, rows, strict=True)]
+
+    def alikeness(first: int, second: int) -> int:
+        return len(mutual_matches(largest[first], largest[second], settings.max_ratio, settings.max_distance))
+
+    pairs = {(first, first + step) for step in (1, 2) for first in range(count - step)}
+    reached = []
+    for first in with_progress(range(count), "compare images", progress):
+        step = 4
+        while first + step < count and alikeness(first, first + step) >= settings.min_alike:
+            pairs.add((first, first + step))
+            step *= 2
+        reached.append(first + step)
+    distributed = range(0, count, -(-count // _LOOP_IMAGES))
+    for row, first in enumerate(distributed):
+        distant = [second for second in distributed[row + 1 :] if second > reached[first]]
+        ranked = sorted(((alikeness(first, second), second) for second in distant), reverse=True)[:_LOOPS]
+        pairs.update((first, second) for alike, second in ranked if alike >= settings.min_alike)
+    return sorted(pairs)

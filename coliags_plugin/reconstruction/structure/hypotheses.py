@@ -52,6 +52,11 @@ class Hypothesis:
     """A bundle-adjusted model, and what it is compared with others by."""
 
     model: pycolmap.Reconstruction
+    images: int  # number of registered ones
+    observations: int  # of points
+    error: float  # mean reprojection error, pixels
+    camera: pycolmap.Camera  # the first
+    fields_of_view: Sequence[float]  # nominal, of each camera, degrees
     correlation: float | None  # of log brightness with log depth; None: unknown
     is_reversed: bool = False  # made by reversing another one's depth
     joins: Mapping[int, Again] = field(default_factory=dict)  # places where models were joined, by the frame before
@@ -61,47 +66,21 @@ class Hypothesis:
         cls, model: pycolmap.Reconstruction, brightness: Sequence[Float[np.ndarray, "K"]], is_reversed: bool = False
     ) -> Hypothesis:
         """The hypothesis of a bundle-adjusted model; ``brightness`` at the features of each image."""
-        return cls(model, brightness_correlation(model, brightness), is_reversed)
+        return cls(
+            model,
+            model.num_reg_images(),
+            model.compute_num_observations(),
+            model.compute_mean_reprojection_error(),
+            next(iter(model.cameras.values())),
+            [field_of_view(camera) for camera in model.cameras.values()],
+            brightness_correlation(model, brightness),
+            is_reversed,
+        )
 
     @property
     def frames(self) -> list[int]:
         """Frames with a pose, ascending."""
         return [number - 1 for number in sorted(self.model.reg_image_ids())]
-
-    @property
-    def images(self) -> int:
-        """Number of registered images."""
-        return int(self.model.num_reg_images())
-
-    @property
-    def observations(self) -> int:
-        """Number of observations of points."""
-        return int(self.model.compute_num_observations())
-
-    @property
-    def error(self) -> float:
-        """Mean reprojection error, pixels."""
-        return float(self.model.compute_mean_reprojection_error())
-
-    @property
-    def camera_model(self) -> str:
-        """COLMAP's name of the first camera's model."""
-        return str(next(iter(self.model.cameras.values())).model_name)
-
-    @property
-    def focal_length(self) -> float:
-        """Focal length of the first camera, pixels."""
-        return float(next(iter(self.model.cameras.values())).mean_focal_length())
-
-    @property
-    def fields_of_view(self) -> list[float]:
-        """Nominal field of view of each camera, degrees."""
-        return [field_of_view(camera) for camera in self.model.cameras.values()]
-
-    @property
-    def distortion(self) -> float:
-        """Distortion by the first camera, at the border."""
-        return distortion(next(iter(self.model.cameras.values())))
 
     @property
     def is_lit_from_the_camera(self) -> bool:
@@ -116,8 +95,9 @@ class Hypothesis:
         """Description of camera, counts, error and light, for logs and errors."""
         light = "unknown" if self.correlation is None else f"{self.correlation:.2f}"
         return (
-            f"{self.camera_model}, focal length {self.focal_length:.0f} px ({self.fields_of_view[0]:.0f} degrees), "
-            f"distortion {100.0 * self.distortion:.0f} %{', depth reversed' if self.is_reversed else ''}: "
+            f"{self.camera.model_name}, focal length {self.camera.mean_focal_length():.0f} px "
+            f"({self.fields_of_view[0]:.0f} degrees), distortion {100.0 * distortion(self.camera):.0f} %"
+            f"{', depth reversed' if self.is_reversed else ''}: "
             f"{self.images} images, {self.observations} observations, reprojection error {self.error:.3g} px, "
             f"correlation of brightness with depth {light}"
         )
@@ -149,8 +129,8 @@ def best(hypotheses: Sequence[Hypothesis]) -> Hypothesis:
     firsts: dict[str, Hypothesis] = {}
     for candidate in candidates:
         if candidate.error <= _SAME_ERROR * exact:
-            firsts.setdefault(candidate.camera_model, candidate)
-    return min(firsts.values(), key=lambda candidate: candidate.distortion)
+            firsts.setdefault(candidate.camera.model_name, candidate)
+    return min(firsts.values(), key=lambda candidate: distortion(candidate.camera))
 
 
 def fitting_focal_lengths(
@@ -161,7 +141,7 @@ def fitting_focal_lengths(
     if chosen.is_lit_from_the_camera:
         rivals = [rival for rival in rivals if rival.is_lit_from_the_camera]
     fitting = [rival for rival in rivals if rival.error <= _SAME_ERROR * chosen.error]
-    return [hypothesis.focal_length for hypothesis in (chosen, *fitting)]
+    return [hypothesis.camera.mean_focal_length() for hypothesis in (chosen, *fitting)]
 
 
 def _explaining(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
@@ -273,7 +253,7 @@ def _trial_on_features(video: MatchedVideo, settings: SfmSettings) -> _Trial:
             return tried[0], [1.0]
         side = max(part.sizes[0])
         lengths = fitting_focal_lengths(hypotheses, chosen, settings.camera.field_of_view)
-        return Start(chosen.camera_model, chosen.focal_length / side), lengths
+        return Start(chosen.camera.model_name, chosen.camera.mean_focal_length() / side), lengths
 
     return trial
 

@@ -168,16 +168,11 @@ class _Comparison:
         """
         firsts = self._posed(first_model, [frame for frame in first_model.frames if frame in earlier][-_FRAMES:])
         seconds = self._posed(second_model, [frame for frame in second_model.frames if frame in later][:_FRAMES])
-        sightings = []
+        attempts = []
         for first, second in product(firsts, seconds):
-            for source, target in ((first, second), (second, first)):
-                sighting = self._sighting(
-                    source, target, first_model if target is first else second_model, target is second
-                )
-                if sighting is not None:
-                    ids, pixels, similarity = sighting
-                    frames = first.number, second.number
-                    sightings.append(_Sighting(frames, target.number, ids, pixels, similarity))
+            attempts.append(self._sighting(first, second, second_model))
+            attempts.append(self._sighting(second, first, first_model, back=True))
+        sightings = [sighting for sighting in attempts if sighting is not None]
         if not sightings:
             return []
         agreeing = _same(sightings, seconds[0])
@@ -202,10 +197,8 @@ class _Comparison:
                 posed.append(_Posed(frame, view, points[tracks], pose))
         return posed
 
-    def _sighting(
-        self, source: _Posed, target: _Posed, seen_by: Hypothesis, forwards: bool
-    ) -> tuple[Int64[np.ndarray, "K"], Float32[np.ndarray, "K 2"], Similarity] | None:
-        """Find a frame's points in another model's frame; tracks, pixels, and the similarity from later to earlier."""
+    def _sighting(self, source: _Posed, target: _Posed, seen_by: Hypothesis, back: bool = False) -> _Sighting | None:
+        """Find a frame's points in a frame of another model, the later one, or with ``back`` the earlier one."""
         import pycolmap
 
         rows, moved = self.finder.find(source.view, target.view)
@@ -215,8 +208,8 @@ class _Comparison:
         options.ransac.max_error, options.ransac.random_seed = _POSE_ERROR * float(target.view.stretch.max()), self.seed
         options.ransac.min_num_trials, options.ransac.max_num_trials = _TRIALS
         pixels, points = target.view.in_image(moved), source.points[rows]
-        camera = next(iter(seen_by.model.cameras.values()))
-        estimate = pycolmap.estimate_and_refine_absolute_pose(pixels.astype(np.float64), points, camera, options)
+        matches = pixels.astype(np.float64), points, seen_by.camera
+        estimate = pycolmap.estimate_and_refine_absolute_pose(*matches, options)
         if estimate is None or estimate["num_inliers"] < _FEWEST_FOUND:
             return None
         pose, fits = estimate["cam_from_world"].matrix(), np.asarray(estimate["inlier_mask"])
@@ -227,11 +220,10 @@ class _Comparison:
             return None
         depths = points[compared] @ pose[2, :3] + pose[2, 3]
         factor = float(np.exp(np.median(np.log(depths / target.depths[np.asarray(nearest)[compared]]))))
-        if forwards:
-            similarity = _between(pose, target.pose, factor)
-        else:
-            similarity = _between(target.pose, pose, 1.0 / factor)
-        return source.view.ids[rows[fits]], pixels[fits], similarity
+        frames, similarity = (source.number, target.number), _between(pose, target.pose, factor)
+        if back:
+            frames, similarity = frames[::-1], _between(target.pose, pose, 1.0 / factor)
+        return _Sighting(frames, target.number, source.view.ids[rows[fits]], pixels[fits], similarity)
 
 
 def _between(pose: Float[np.ndarray, "3 4"], same: Float[np.ndarray, "3 4"], factor: float) -> Similarity:

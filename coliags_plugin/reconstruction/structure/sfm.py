@@ -15,8 +15,7 @@ from jaxtyping import Float
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.jobs import Progress, with_progress
-from coliags_plugin.geometry.poses.rigid import inverse
-from coliags_plugin.geometry.poses.trajectory import Trajectory
+from coliags_plugin.geometry.poses.trajectory import Trajectory, inverse
 from coliags_plugin.reconstruction.structure.adjustment import held_out_error, rigid_frames, rigidity
 from coliags_plugin.reconstruction.structure.atlas import Again, Link, contradictions, link_at, part_of, weak_links
 from coliags_plugin.reconstruction.structure.features import quiet_colmap
@@ -70,7 +69,7 @@ class Reconstruction:
     @property
     def median_depth(self) -> float:
         """Median z-depth of the model's points over all observations, in the model's unit."""
-        return median_depth(self.model)
+        return float(np.median(np.concatenate([depths for _, depths in depths_of(self.model).values()])))
 
     def summary(self) -> str:
         """One-line summary."""
@@ -82,11 +81,6 @@ class Reconstruction:
             f"{f' and {len(others)} further cameras' if others else ''}, "
             f"field of view {field_of_view(camera, self.lens_side):.0f} degrees"
         )
-
-
-def median_depth(model: pycolmap.Reconstruction) -> float:
-    """Median z-depth of a model's points over all observations, in the model's unit."""
-    return float(np.median(np.concatenate([depths for _, depths in depths_of(model).values()])))
 
 
 @dataclass(frozen=True, eq=False)
@@ -238,7 +232,7 @@ def _atlas(
         video, hypotheses, apart = join_models(video, hypotheses, settings, masks, progress)
     joined_again = {after for hypothesis in hypotheses for after in hypothesis.joins}
     refused = [link for link in refused if link.after not in joined_again]
-    models = [_result(video, model, _links(model) if video.tracks else ()) for model in hypotheses]
+    models = [_result(video, model) for model in hypotheses]
     models.sort(key=lambda model: -len(model.registered))
     posed = {index for model in models for index in model.registered}
     lost = {index: _reason(video, index) for index in range(len(video.images)) if index not in posed}
@@ -268,7 +262,8 @@ def _rigid_stretches(hypothesis: Hypothesis, video: MatchedVideo) -> tuple[list[
         return [hypothesis], []
     frames = hypothesis.frames
     centers = np.array([hypothesis.model.images[frame + 1].projection_center() for frame in frames])
-    places = _far_apart(centers, count, _LEAST_EXTENT * median_depth(hypothesis.model))
+    depths = np.concatenate([depths for _, depths in depths_of(hypothesis.model).values()])
+    places = _far_apart(centers, count, _LEAST_EXTENT * float(np.median(depths)))
     if not places:
         return [hypothesis], []
     stretches = [stretch.tolist() for stretch in np.split(frames, places)]
@@ -302,14 +297,6 @@ def _apart(links: Sequence[Link], least: int) -> list[Link]:
             groups.append([])
         groups[-1].append(link)
     return [min(group, key=lambda link: link.points) for group in groups]
-
-
-def _links(hypothesis: Hypothesis) -> tuple[Link, ...]:
-    """Weak places of a model that hold, and those at which it was joined."""
-    model = hypothesis.model
-    weak = {link.after: link for link in weak_links(model) if link.holds}
-    joined = {after: replace(link_at(model, after), again=again) for after, again in hypothesis.joins.items()}
-    return tuple(link for _, link in sorted({**weak, **joined}.items()))
 
 
 def _refusal(video: MatchedVideo, candidate: Reconstruction, largest: Reconstruction) -> str | None:
@@ -359,30 +346,26 @@ def _reason(video: MatchedVideo, index: int) -> str:
 _LIT = -0.15
 
 
-def _result(video: MatchedVideo, chosen: Hypothesis, links: tuple[Link, ...]) -> Reconstruction:
+def _result(video: MatchedVideo, chosen: Hypothesis) -> Reconstruction:
     images, model = video.images, chosen.model
     registered = chosen.frames
     world_to_camera = np.tile(np.eye(4), (len(registered), 1, 1))
     for row, index in enumerate(registered):
         world_to_camera[row, :3] = model.images[index + 1].cam_from_world().matrix()
-    error = held_out_error(model, video.tracks) if video.tracks else None
-    residuals = rigidity(model, video.tracks) if video.tracks else {}
-    poses = inverse(world_to_camera)
+    result = Reconstruction(images, tuple(registered), inverse(world_to_camera), video.names, model, chosen.correlation)
+    if video.tracks:
+        links = {link.after: link for link in weak_links(model) if link.holds}
+        links |= {after: replace(link_at(model, after), again=again) for after, again in chosen.joins.items()}
+        result = replace(
+            result,
+            links=tuple(link for _, link in sorted(links.items())),
+            test_error=held_out_error(model, video.tracks),
+            rigidity=rigidity(model, video.tracks),
+        )
     if video.picture is not None:
+        result = replace(result, lens_side=max(video.picture.size))
         video.picture.to_frame(model)
     _color(model, images)
-    reconstruction = Reconstruction(
-        images,
-        tuple(registered),
-        poses,
-        video.names,
-        model,
-        chosen.correlation,
-        links,
-        error,
-        None if video.picture is None else max(video.picture.size),
-        residuals,
-    )
     if chosen.correlation is None or chosen.correlation > _LIT:
         log.warning(
             "images %s to %s: nearer points are hardly brighter (correlation of brightness with depth %s): the model "
@@ -391,7 +374,7 @@ def _result(video: MatchedVideo, chosen: Hypothesis, links: tuple[Link, ...]) ->
             images[registered[-1]].name,
             "unknown" if chosen.correlation is None else f"{chosen.correlation:.2f}",
         )
-    return reconstruction
+    return result
 
 
 def _color(model: pycolmap.Reconstruction, images: Sequence[Path]) -> None:

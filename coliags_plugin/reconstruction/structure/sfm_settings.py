@@ -15,10 +15,41 @@ from typing_extensions import Self
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.settings import Settings
 from coliags_plugin.geometry.lenses.models import LENSES, FisheyeLens, Lens
-from coliags_plugin.reconstruction.structure.features import FeatureSettings
 
 if TYPE_CHECKING:
     import pycolmap
+
+
+class FeatureSettings(Settings):
+    """Options of SIFT extraction. COLMAP's defaults find about a hundred points on a colon's wall."""
+
+    local_contrast: float = Field(
+        default=4.0,
+        ge=0.0,
+        description="Clip limit of CLAHE (contrast-limited adaptive histogram equalisation) of the grey image, on "
+        "8 x 8 tiles; 0: none.",
+    )
+    peak_threshold: float = Field(
+        default=0.001, gt=0.0, description="SIFT peak (contrast) threshold. COLMAP's default is 0.0067."
+    )
+    max_features: int = Field(
+        default=4000, ge=1, description="Largest number of features per image; those of the largest scale are kept."
+    )
+    upright: bool = Field(
+        default=True,
+        description="Upright SIFT, without orientation: more features match, as long as the camera rolls by less than "
+        "about 20 degrees between matched images.",
+    )
+    highlight_level: int = Field(
+        default=250, ge=1, le=256, description="Brightness (of 255) from which a pixel is a highlight; 256: none is."
+    )
+    highlight_ratio: float = Field(
+        default=1.5,
+        gt=1.0,
+        description="A pixel this many times as bright as its surroundings, and brighter by at least 20 of 255, is "
+        "also a highlight; highlights move with the light source.",
+    )
+    margin: int = Field(default=3, ge=0, description="Dilation of highlights and masks, pixels.")
 
 
 class CameraSettings(Settings):

@@ -19,11 +19,17 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import has_alpha, tell_of_alpha
 from coliags_plugin.core.jobs import Progress, with_progress
 from coliags_plugin.reconstruction.structure.adjustment import TEST_EVERY
-from coliags_plugin.reconstruction.structure.features import Features, feature_extractor
+from coliags_plugin.reconstruction.structure.features import (
+    Features,
+    Matches,
+    alike_pairs,
+    epipolar_inliers,
+    feature_extractor,
+    mutual_matches,
+)
 from coliags_plugin.reconstruction.structure.image_files import Masks, file_names, is_repeated, mask_of, read_image
 from coliags_plugin.reconstruction.structure.mapping import brightness_at, map_images, map_tracks
-from coliags_plugin.reconstruction.structure.matching import Matches, alike_pairs, epipolar_inliers, mutual_matches
-from coliags_plugin.reconstruction.structure.point_tracks import FramePoints, track_points
+from coliags_plugin.reconstruction.structure.point_tracks import FramePoints, sharpness, track_points
 from coliags_plugin.reconstruction.structure.sfm_settings import (
     Picture,
     SfmSettings,
@@ -32,7 +38,6 @@ from coliags_plugin.reconstruction.structure.sfm_settings import (
     has_known_camera,
     starting_cameras,
 )
-from coliags_plugin.reconstruction.structure.texture import sharpness
 
 if TYPE_CHECKING:
     import pycolmap

@@ -15,8 +15,7 @@ from jaxtyping import Bool, Float
 from coliags_plugin.core.files import atomic_folder, atomic_write, refuse_existing, write_json
 from coliags_plugin.core.scenes import Scene
 from coliags_plugin.engine.data_formats import open_scene
-from coliags_plugin.geometry.meshes.files import write_mesh
-from coliags_plugin.geometry.meshes.mesh import TriangleMesh
+from coliags_plugin.geometry.meshes.mesh import TriangleMesh, write_mesh
 from coliags_plugin.reporting.html_page import write_html
 from coliags_plugin.reporting.image_files import write_png
 from coliags_plugin.reporting.model import Fact, FactList, Paragraph

@@ -19,8 +19,7 @@ from coliags_plugin.engine.data_formats import open_scene
 from coliags_plugin.engine.progress import ProgressReport
 from coliags_plugin.engine.trained import TrainedRun
 from coliags_plugin.engine.truth import match_truth
-from coliags_plugin.geometry.meshes.files import MESH_FORMATS, write_mesh
-from coliags_plugin.geometry.meshes.mesh import Texture, TriangleMesh
+from coliags_plugin.geometry.meshes.mesh import MESH_FORMATS, Texture, TriangleMesh, write_mesh
 from coliags_plugin.geometry.meshes.truth import (
     SurfaceComparison,
     TrueSurface,

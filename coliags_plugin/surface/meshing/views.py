@@ -21,7 +21,8 @@ from coliags_plugin.core.settings import Settings
 from coliags_plugin.engine.held_light import held_light, render_held
 from coliags_plugin.engine.rendering import render_view
 from coliags_plugin.engine.trained import TrainedRun
-from coliags_plugin.reconstruction.structure.features import FeatureSettings, highlights, image_and_mask
+from coliags_plugin.reconstruction.structure.features import highlights, image_and_mask
+from coliags_plugin.reconstruction.structure.sfm_settings import FeatureSettings
 from coliags_plugin.reporting.image_files import eight_bit
 
 

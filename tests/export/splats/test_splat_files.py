@@ -23,8 +23,7 @@ from coliags_plugin.core.ply import read_vertices, write_ply
 from coliags_plugin.export.splats import spz
 from coliags_plugin.export.splats.cloud import THICKNESS_SHARE, SplatCloud, read_splats, reader_of, write_splats
 from coliags_plugin.fields import spherical_harmonics
-from coliags_plugin.geometry.meshes.files import write_mesh
-from coliags_plugin.geometry.meshes.mesh import TriangleMesh
+from coliags_plugin.geometry.meshes.mesh import TriangleMesh, write_mesh
 from tests.export.splats.clouds import covariances, random_cloud, read_glb
 
 DOCUMENTATION = Path(__file__).parents[3] / "docs/export.md"

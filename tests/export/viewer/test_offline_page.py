@@ -26,8 +26,7 @@ from coliags_plugin.export.baking import distillation
 from coliags_plugin.export.splats.cloud import field_of_cloud, read_splats
 from coliags_plugin.export.viewer.page import CameraPath, Layer, most_visible, page_html, scene_page
 from coliags_plugin.fields.spherical_harmonics import Y0
-from coliags_plugin.geometry.meshes.files import write_mesh
-from coliags_plugin.geometry.meshes.mesh import TriangleMesh
+from coliags_plugin.geometry.meshes.mesh import TriangleMesh, write_mesh
 from coliags_plugin.renderers.torch_renderer import TorchRenderer, TorchRendererSettings
 from coliags_plugin.surface.coverage.visibility import Level
 from tests.commands import refused, run

@@ -25,8 +25,7 @@ from coliags_plugin.engine.camera_path import CameraPath
 from coliags_plugin.engine.held_light import flatten
 from coliags_plugin.engine.rendering import depth_picture, render_view, sampled_depth_limits
 from coliags_plugin.export.viewer import live
-from coliags_plugin.geometry.meshes.files import read_mesh, write_mesh
-from coliags_plugin.geometry.meshes.mesh import TriangleMesh
+from coliags_plugin.geometry.meshes.mesh import TriangleMesh, read_mesh, write_mesh
 from coliags_plugin.reporting.image_files import as_array, eight_bit
 from tests.commands import refused
 from tests.comparison.small import until

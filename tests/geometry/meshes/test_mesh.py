@@ -11,8 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.geometry.meshes.files import MESH_FORMATS, read_mesh, write_mesh
-from coliags_plugin.geometry.meshes.mesh import Texture, TriangleMesh
+from coliags_plugin.geometry.meshes.mesh import MESH_FORMATS, Texture, TriangleMesh, read_mesh, write_mesh
 from coliags_plugin.geometry.meshes.truth import (
     TrueSurface,
     compare_meshes,

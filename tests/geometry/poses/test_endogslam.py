@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.geometry.poses import endogslam
-from coliags_plugin.geometry.poses.rigid import inverse
+from coliags_plugin.geometry.poses.trajectory import inverse
 from tests.geometry.poses.winding import PINHOLE, winding
 
 FRAMES, GAUSSIANS = 5, 7

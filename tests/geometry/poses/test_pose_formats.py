@@ -12,8 +12,7 @@ from coliags_plugin.config.registry import pose_formats
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.geometry.poses.formats import format_named, format_of, write_trajectory
-from coliags_plugin.geometry.poses.rigid import inverse
-from coliags_plugin.geometry.poses.trajectory import Trajectory
+from coliags_plugin.geometry.poses.trajectory import Trajectory, inverse
 from tests.geometry.poses.winding import PINHOLE, as_text, trajectories, winding
 
 WRITABLE = [name for name in pose_formats if format_named(name).write is not None]

@@ -18,8 +18,13 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.geometry.poses import nerfstudio, tum
 from coliags_plugin.geometry.poses.c3vd import read_poses
 from coliags_plugin.geometry.poses.formats import format_of
-from coliags_plugin.geometry.poses.rigid import rigid, rotation_angles_deg, rotations_from_wxyz, wxyz_from_rotations
-from coliags_plugin.geometry.poses.trajectory import Trajectory
+from coliags_plugin.geometry.poses.trajectory import (
+    Trajectory,
+    rigid,
+    rotation_angles_deg,
+    rotations_from_wxyz,
+    wxyz_from_rotations,
+)
 from tests.datamanagers.wall_scenes import poses
 from tests.geometry.poses.winding import as_text, some_transform, winding
 

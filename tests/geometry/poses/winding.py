@@ -7,8 +7,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from coliags_plugin.core.intrinsics import Intrinsics
-from coliags_plugin.geometry.poses.rigid import rigid
-from coliags_plugin.geometry.poses.trajectory import Trajectory
+from coliags_plugin.geometry.poses.trajectory import Trajectory, rigid
 
 PINHOLE = Intrinsics(61.0, 55.0, 33.5, 21.5, 64, 48)
 

@@ -20,8 +20,7 @@ from coliags_plugin.core.scene_files import write_unit
 from coliags_plugin.datamanagers.fusion import load_points
 from coliags_plugin.datamanagers.reading.images import read_gray
 from coliags_plugin.engine.data_formats import open_scene
-from coliags_plugin.reconstruction.depth.estimate import Estimation, check_video
-from coliags_plugin.reconstruction.depth.work_files import WorkFolder
+from coliags_plugin.reconstruction.depth.estimate import Estimation, WorkFolder, check_video
 from tests import commands
 from tests.commands import run
 from tests.reconstruction.depth.walls import NORMAL, OFFSET, sideways, wall_depth, wall_frames

@@ -12,13 +12,15 @@ from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import write_image
 from coliags_plugin.core.scenes import Frame, SparseDepth
-from coliags_plugin.reconstruction.depth.depth_range import difference_from_neighbours, find_range, given_range
 from coliags_plugin.reconstruction.depth.estimate import choose_neighbours
 from coliags_plugin.reconstruction.depth.numba_kernels.kernels import aggregate, pick, sweep, vote
 from coliags_plugin.reconstruction.depth.priors import (
     FilePrior,
     LightPrior,
     complete,
+    difference_from_neighbours,
+    find_range,
+    given_range,
     near_rim,
     robust_fit,
     smooth_surface,
@@ -34,8 +36,8 @@ from coliags_plugin.reconstruction.depth.sweeping import (
     ratios,
     sweep_frame,
 )
-from coliags_plugin.reconstruction.structure.features import FeatureSettings
-from coliags_plugin.reconstruction.structure.matching import Pose
+from coliags_plugin.reconstruction.structure.features import Pose
+from coliags_plugin.reconstruction.structure.sfm_settings import FeatureSettings
 from tests.reconstruction.depth.walls import sideways, wall_depth, wall_frames
 
 FEATURES = FeatureSettings(highlight_level=256)

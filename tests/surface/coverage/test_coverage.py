@@ -18,8 +18,7 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import read_8_bit, write_image
 from coliags_plugin.core.provenance import Provenance
 from coliags_plugin.core.settings import validated
-from coliags_plugin.geometry.meshes.files import read_mesh, write_mesh
-from coliags_plugin.geometry.meshes.mesh import TriangleMesh
+from coliags_plugin.geometry.meshes.mesh import TriangleMesh, read_mesh, write_mesh
 from coliags_plugin.surface.coverage.centreline import (
     NoLumenError,
     find_centreline,

@@ -15,8 +15,7 @@ from coliags_plugin.core.provenance import Provenance
 from coliags_plugin.core.render_output import RenderOutput
 from coliags_plugin.core.scene_files import write_unit
 from coliags_plugin.core.scenes import PointCloud
-from coliags_plugin.geometry.meshes.files import read_mesh, write_mesh
-from coliags_plugin.geometry.meshes.mesh import TriangleMesh
+from coliags_plugin.geometry.meshes.mesh import TriangleMesh, read_mesh, write_mesh
 from coliags_plugin.reporting.text_formats import terminal_text
 from coliags_plugin.surface.meshing import views
 from coliags_plugin.surface.meshing.colors import best_texture
