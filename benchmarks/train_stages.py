@@ -62,7 +62,7 @@ class Handed:
         self.made = gaussians
         self.primitive = primitive
 
-    def gaussians(self, camera: Any) -> Gaussians:
+    def gaussians(self, camera: Any, light: object = None, generator: object = None) -> Gaussians:
         """The same whatever the camera."""
         return self.made
 

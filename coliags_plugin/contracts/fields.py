@@ -110,16 +110,16 @@ class GaussianField(Field[SettingsT]):
         return 1
 
     @abstractmethod
-    def gaussians(self, camera: Camera) -> Gaussians:
-        """The Gaussians this camera sees, differentiable with respect to the field's parameters and the pose."""
+    def gaussians(
+        self, camera: Camera, light: HeldLight | None = None, generator: torch.Generator | None = None
+    ) -> Gaussians:
+        """The Gaussians this camera sees, differentiable with respect to the field's parameters and the pose.
 
-    def gaussians_in_light(self, camera: Camera, light: HeldLight | None) -> Gaussians:
-        """:meth:`gaussians` with the lamp held, if there is a light, not moving with the camera; default: the same."""
-        return self.gaussians(camera)
-
-    def gaussians_in_training(self, camera: Camera, generator: torch.Generator) -> Gaussians:
-        """:meth:`gaussians` in a training step: with noise from the generator where there is any; default: without."""
-        return self.gaussians(camera)
+        Args:
+            camera: Viewpoint.
+            light: The lamp, where it is held and does not move with the camera.
+            generator: In a training step, of noise where there is any; None: without.
+        """
 
 
 @dataclass(frozen=True)
@@ -140,7 +140,11 @@ class RadianceLevel(ABC):
 
     @abstractmethod
     def query(
-        self, positions: Float[Tensor, "P S 3"], directions: Float[Tensor, "P 3"], camera: Camera
+        self,
+        positions: Float[Tensor, "P S 3"],
+        directions: Float[Tensor, "P 3"],
+        camera: Camera,
+        generator: torch.Generator | None = None,
     ) -> RadianceSamples:
         """Density and colour at points along the rays of one camera.
 
@@ -148,17 +152,8 @@ class RadianceLevel(ABC):
             positions: World frame, scene units. [P, S, 3]
             directions: Unit vectors from the camera. [P, 3]
             camera: Camera of the rays; its centre and optical axis are the lamp's too.
+            generator: In a training step, of noise where there is any; None: without.
         """
-
-    def query_in_training(
-        self,
-        positions: Float[Tensor, "P S 3"],
-        directions: Float[Tensor, "P 3"],
-        camera: Camera,
-        generator: torch.Generator,
-    ) -> RadianceSamples:
-        """:meth:`query` in a training step: with noise from the generator where there is any; default: without."""
-        return self.query(positions, directions, camera)
 
     def query_density(
         self, positions: Float[Tensor, "P S 3"], directions: Float[Tensor, "P 3"], camera: Camera

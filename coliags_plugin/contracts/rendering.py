@@ -86,6 +86,7 @@ class Renderer(ABC, Generic[SettingsT, RenderedT]):
         camera: Camera,
         wants: Sequence[str] = ("rgb", "alpha"),
         pixels: Int[Tensor, "P 2"] | None = None,
+        generator: torch.Generator | None = None,
     ) -> RenderOutput:
         """Render one view, or some of its pixels.
 
@@ -95,21 +96,11 @@ class Renderer(ABC, Generic[SettingsT, RenderedT]):
             wants: Names from :data:`coliags_plugin.core.render_output.OUTPUTS` or of the field's feature channels; rgb
                 and alpha always come.
             pixels: Columns and rows of the only pixels to render, as an image of P rows and one column. [P, 2]
+            generator: In a training step, of random samples where there are any; None renders without chance.
 
         Raises:
             InputError: The field, an output or ``pixels`` is not for this renderer.
         """
-
-    def render_in_training(
-        self,
-        field: RenderedT,
-        camera: Camera,
-        wants: Sequence[str],
-        pixels: Int[Tensor, "P 2"] | None,
-        generator: torch.Generator,
-    ) -> RenderOutput:
-        """:meth:`render` in a training step: with random samples from the generator where there are any."""
-        return self.render(field, camera, wants, pixels)
 
     def check_field(self, field: RenderedT, near_plane: float) -> None:
         """Check, before training, that the renderer's options fit a field and the near plane of its cameras.

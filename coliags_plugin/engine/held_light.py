@@ -71,7 +71,7 @@ def render_held(model: Model, camera: Camera, light: HeldLight | None, wants: Se
     """Render a view of a model under a held light, or else the camera's own lamp, without view modules."""
     camera, field, renderer = model.placed(camera), gaussians_of(model), splatting_of(model)
     scaled = None if light is None else light.scaled(model.scale)
-    return model.in_scene_units(renderer.draw(field.gaussians_in_light(camera, scaled), camera, wants))
+    return model.in_scene_units(renderer.draw(field.gaussians(camera, scaled), camera, wants))
 
 
 def gaussians_of(model: Model) -> GaussianField:

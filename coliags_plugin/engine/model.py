@@ -105,10 +105,7 @@ class Model(nn.Module):
         """
         camera, modules = self.adjusted(camera, view), self.view_modules.values()
         needed = tuple(dict.fromkeys([*wants, *(name for module in modules for name in sorted(module.wants))]))
-        if generator is None:
-            stages = [self.renderer.render(self.field, camera, needed, pixels)]
-        else:
-            stages = [self.renderer.render_in_training(self.field, camera, needed, pixels, generator)]
+        stages = [self.renderer.render(self.field, camera, needed, pixels, generator)]
         for module in modules:
             stages.append(module.shade(stages[-1], view))
         return [self.in_scene_units(stage) for stage in stages]

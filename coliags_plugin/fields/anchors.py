@@ -188,15 +188,10 @@ class AnchorField(GaussianField[AnchorFieldSettings]):
         camera = camera.to(self.anchors.device, self.anchors.dtype)
         return (self.anchors[self.visible_anchors(camera)] - camera.center).norm(dim=1)
 
-    def gaussians(self, camera: Camera) -> Gaussians:
-        """Decode the visible anchors (docs/methods.md 3.5)."""
-        return self._decoded(camera, None)
-
-    def gaussians_in_light(self, camera: Camera, light: HeldLight | None) -> Gaussians:
-        """Decode the visible anchors, whose distances and angles to the lamp are a held light's, if there is one."""
-        return self._decoded(camera, light)
-
-    def _decoded(self, camera: Camera, light: HeldLight | None) -> Gaussians:
+    def gaussians(
+        self, camera: Camera, light: HeldLight | None = None, generator: torch.Generator | None = None
+    ) -> Gaussians:
+        """Decode the visible anchors (docs/methods.md 3.5); a held light gives distances and angles to the lamp."""
         camera = camera.to(self.anchors.device, self.anchors.dtype)
         decoded = self._on_device(camera, light) if fit_triton_kernels(self.anchors) else None
         drawn, visible = decoded or self._of_visible(camera, light)

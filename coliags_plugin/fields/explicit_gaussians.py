@@ -13,6 +13,7 @@ from typing_extensions import Self
 from coliags_plugin.contracts import Schedule
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.gaussians import Gaussians
+from coliags_plugin.core.lamps import HeldLight
 from coliags_plugin.core.scenes import Scene
 from coliags_plugin.core.settings import Settings
 from coliags_plugin.core.tensors import fit_kernels
@@ -63,7 +64,9 @@ class ExplicitGaussians(ExplicitField[ExplicitGaussiansSettings]):
         """Raise the active degree of spherical harmonics every ``sh_every`` steps."""
         self.degree.fill_(min(self.settings.sh_degree, step // schedule.interval(self.settings.sh_every)))
 
-    def gaussians(self, camera: Camera) -> Gaussians:
+    def gaussians(
+        self, camera: Camera, light: HeldLight | None = None, generator: torch.Generator | None = None
+    ) -> Gaussians:
         """The Gaussians in the camera's view with their colours from there."""
         camera = camera.to(self.means.device, self.means.dtype)
         visible = self._in_view(camera).nonzero().squeeze(1)

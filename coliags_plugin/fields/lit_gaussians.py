@@ -202,21 +202,14 @@ class LitGaussians(ExplicitField[LitGaussiansSettings]):
     def _max_log_scale(self) -> Tensor:
         return (self.settings.max_scale_share * self.extent).log()
 
-    def gaussians(self, camera: Camera) -> Gaussians:
-        """The Gaussians in the camera's view with the light they reflect towards it."""
-        return self._gaussians(camera, None)
-
-    def gaussians_in_light(self, camera: Camera, light: HeldLight | None) -> Gaussians:
-        """The Gaussians in view under a held lamp as intense as the trained one, alike in all directions."""
-        return self._gaussians(camera, None, light)
-
-    def gaussians_in_training(self, camera: Camera, generator: torch.Generator) -> Gaussians:
-        """The Gaussians in view; noise is on the network's inputs, and its products are in ``network_precision``."""
-        return self._gaussians(camera, generator)
-
-    def _gaussians(
-        self, camera: Camera, generator: torch.Generator | None, held_light: HeldLight | None = None
+    def gaussians(
+        self, camera: Camera, light: HeldLight | None = None, generator: torch.Generator | None = None
     ) -> Gaussians:
+        """The Gaussians in the camera's view with the light they reflect towards it.
+
+        A held lamp is as intense as the trained one, alike in all directions. In training noise is on the network's
+        inputs, and its products are in ``network_precision``.
+        """
         camera = camera.to(self.means.device, self.means.dtype)
         bright = self.opacities.detach().sigmoid() >= MIN_OPACITY
         visible = (self._in_view(camera) & bright).nonzero().squeeze(1)
@@ -227,15 +220,13 @@ class LitGaussians(ExplicitField[LitGaussiansSettings]):
         albedos = albedos.clamp_min(0.0)
         roughness = roughness.clamp(*self.settings.roughness_range)
         f0 = f0.clamp(*self.settings.f0_range)
-        light, factors = self._reflected(
-            camera, means, third_axes(quats), albedos, roughness, f0, generator, held_light
-        )
+        reflected, factors = self._reflected(camera, means, third_axes(quats), albedos, roughness, f0, generator, light)
         return Gaussians(
             means=means,
             quats_wxyz=quats,
             scales=torch.cat([scales, torch.full_like(scales[:, :1], THICKNESS)], dim=1),
             opacities=logits.sigmoid(),
-            colors=light.clamp_min(MIN_LIGHT).pow(1.0 / GAMMA),
+            colors=reflected.clamp_min(MIN_LIGHT).pow(1.0 / GAMMA),
             source_index=visible,
             visible_sources=visible,
             features={"albedo": albedos, "roughness": roughness[:, None], "f0": f0[:, None], "diffuse_factor": factors},

@@ -191,31 +191,21 @@ class _NetworkLevel(RadianceLevel):
         """Scene units to the network's coordinates, and the network."""
 
     def query(
-        self, positions: Float[Tensor, "P S 3"], directions: Float[Tensor, "P 3"], camera: Camera
-    ) -> RadianceSamples:
-        return self._samples(positions, directions, camera, None)
-
-    def query_in_training(
         self,
         positions: Float[Tensor, "P S 3"],
         directions: Float[Tensor, "P 3"],
         camera: Camera,
-        generator: torch.Generator,
-    ) -> RadianceSamples:
-        return self._samples(positions, directions, camera, generator)
-
-    def query_density(
-        self, positions: Float[Tensor, "P S 3"], directions: Float[Tensor, "P 3"], camera: Camera
-    ) -> Float[Tensor, "P S"]:
-        return self._density(self._hidden(positions, None), len(positions), None)
-
-    def _samples(
-        self, positions: Tensor, directions: Tensor, camera: Camera, generator: torch.Generator | None
+        generator: torch.Generator | None = None,
     ) -> RadianceSamples:
         normalisation, network = self._parts()
         hidden = self._hidden(positions, generator)
         rgb = network.colors(hidden, directions, normalisation(camera.center))
         return RadianceSamples(self._density(hidden, len(positions), generator), rgb)
+
+    def query_density(
+        self, positions: Float[Tensor, "P S 3"], directions: Float[Tensor, "P 3"], camera: Camera
+    ) -> Float[Tensor, "P S"]:
+        return self._density(self._hidden(positions, None), len(positions), None)
 
     def _hidden(self, positions: Tensor, generator: torch.Generator | None) -> Tensor:
         normalisation, network = self._parts()

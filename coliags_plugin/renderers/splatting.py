@@ -86,30 +86,9 @@ class SplattingRenderer(Renderer[SplattingT, GaussianField]):
         camera: Camera,
         wants: Sequence[str] = ("rgb", "alpha"),
         pixels: Tensor | None = None,
+        generator: torch.Generator | None = None,
     ) -> RenderOutput:
         """Draw a view as :class:`Renderer` says; refuses ``pixels``, as whole images are drawn."""
-        self._check(field, pixels)
-        return self.draw(field.gaussians(camera), camera, wants)
-
-    def render_in_training(
-        self,
-        field: GaussianField,
-        camera: Camera,
-        wants: Sequence[str],
-        pixels: Tensor | None,
-        generator: torch.Generator,
-    ) -> RenderOutput:
-        """:meth:`render` in a training step, with noise of the field from the generator where there is any."""
-        self._check(field, pixels)
-        return self.draw(field.gaussians_in_training(camera, generator), camera, wants)
-
-    def check_field(self, field: GaussianField, near_plane: float) -> None:
-        """Refuse a near plane beyond ``distortion_far``."""
-        if isinstance(self.settings, CutSettings):
-            self.settings.distortion_slope(near_plane)
-
-    def _check(self, field: GaussianField, pixels: Tensor | None) -> None:
-        """Refuse single pixels, and fields that are not for this renderer."""
         if pixels is not None:
             raise InputError(
                 f"the {self.name} renderer was requested to render single pixels",
@@ -117,6 +96,12 @@ class SplattingRenderer(Renderer[SplattingT, GaussianField]):
                 "Leave pixels out, or choose a renderer of radiance fields",
             )
         self.check_primitive(field)
+        return self.draw(field.gaussians(camera, generator=generator), camera, wants)
+
+    def check_field(self, field: GaussianField, near_plane: float) -> None:
+        """Refuse a near plane beyond ``distortion_far``."""
+        if isinstance(self.settings, CutSettings):
+            self.settings.distortion_slope(near_plane)
 
     @abstractmethod
     def draw(self, gaussians: Gaussians, camera: Camera, wants: Sequence[str]) -> RenderOutput:

@@ -101,33 +101,13 @@ class VolumeRenderer(Renderer[VolumeRendererSettings, RadianceField]):
         camera: Camera,
         wants: Sequence[str] = ("rgb", "alpha"),
         pixels: Tensor | None = None,
+        generator: torch.Generator | None = None,
     ) -> RenderOutput:
-        """Render a view, or some of its pixels, as :class:`Renderer` says.
+        """Render a view, or some of its pixels, as :class:`Renderer` says; in training samples may be at random places.
 
         Outputs of the first pass have ``_coarse`` behind their names; ``ray_lengths`` is the length of a pixel's ray
         per z-depth. Depths are z-depths; there are no normals and no distortion.
         """
-        return self._render(field, camera, wants, pixels, None)
-
-    def render_in_training(
-        self,
-        field: RadianceField,
-        camera: Camera,
-        wants: Sequence[str],
-        pixels: Tensor | None,
-        generator: torch.Generator,
-    ) -> RenderOutput:
-        """:meth:`render` with samples at random places and the field's noise."""
-        return self._render(field, camera, wants, pixels, generator)
-
-    def _render(
-        self,
-        field: RadianceField,
-        camera: Camera,
-        wants: Sequence[str],
-        pixels: Tensor | None,
-        generator: torch.Generator | None,
-    ) -> RenderOutput:
         self.check_primitive(field)
         check_outputs(wants, sorted(self.outputs))
         like: Any = next(field.parameters())
@@ -190,7 +170,7 @@ class VolumeRenderer(Renderer[VolumeRendererSettings, RadianceField]):
         rgb: Tensor | None = None
         if generator is not None:
             where = (lines.positions(camera, places), lines.directions, camera)
-            samples = level.query_in_training(*where, generator)
+            samples = level.query(*where, generator)
             density, rgb = samples.density, samples.rgb
         elif torch.is_grad_enabled():
             density, rgb = _samples(level, camera, lines, places, slice(None), colors)

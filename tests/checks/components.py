@@ -78,7 +78,7 @@ class Fog(RadianceField):
         field.load_state_dict(state)
         return field
 
-    def query(self, positions, directions, camera):
+    def query(self, positions, directions, camera, generator=None):
         behind = (positions - camera.center.to(positions)).norm(dim=-1, keepdim=True) > 25.0
         values = torch.where(behind, self.far, self.near)
         return RadianceSamples(nn.functional.softplus(values[..., 0]), values[..., 1:].sigmoid())
@@ -192,7 +192,7 @@ CountsMaskedPixels = loss(lambda value, step: (step.output.rgb - step.target.rgb
 
 def balls(change, **attributes):
     """The field with its Gaussians changed by a function."""
-    return changed(Balls, gaussians=lambda self, camera: change(Balls.gaussians(self, camera)), **attributes)
+    return changed(Balls, gaussians=lambda self, camera, **chance: change(Balls.gaussians(self, camera)), **attributes)
 
 
 HasADetachedGroup = balls(lambda gaussians: replace(gaussians, means=gaussians.means.detach()))
@@ -205,10 +205,12 @@ NaNFeature = balls(
 
 
 def renderer(render, base=CpuRenderer, **attributes):
-    """A renderer that calls a function with the method of its base and the arguments of that."""
+    """A renderer that, but in training, calls a function with the method of its base and the arguments of that."""
 
     class Altered(base):
-        def render(self, field, camera, wants=("rgb", "alpha"), pixels=None):
+        def render(self, field, camera, wants=("rgb", "alpha"), pixels=None, generator=None):
+            if generator is not None:
+                return super().render(field, camera, wants, pixels, generator)
             return render(super().render, field, camera, wants, pixels)
 
     return changed(Altered, **attributes)
@@ -282,7 +284,7 @@ class ForgetsABuffer(Balls):
     def before_step(self, step, schedule):
         self.glow = 0.01 * step
 
-    def gaussians(self, camera):
+    def gaussians(self, camera, light=None, generator=None):
         plain = super().gaussians(camera)
         return replace(plain, colors=(plain.colors + self.glow).clamp_max(1.0))
 

@@ -170,7 +170,7 @@ def test_factors_multiply_the_diffuse_light_alone():
 
 
 def in_training(field, seed=5):
-    return field.gaussians_in_training(camera_at(0, 0, 0), torch.Generator().manual_seed(seed))
+    return field.gaussians(camera_at(0, 0, 0), generator=torch.Generator().manual_seed(seed))
 
 
 def test_noise_is_of_training_alone_and_the_generators():

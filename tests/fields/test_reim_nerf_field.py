@@ -92,12 +92,12 @@ def test_bfloat16_is_of_rendering_alone():
     camera = camera_at(0, 0, 0).to(dtype=torch.float32)
     full, half = (make(render_precision=precision, density_noise=0.0).float() for precision in ("float32", "bfloat16"))
     where = (positions, directions, camera)
-    trained, drawn = ([field.query(*where), field.query_in_training(*where, generator())] for field in (full, half))
+    trained, drawn = ([field.query(*where), field.query(*where, generator())] for field in (full, half))
     for one, other in zip(trained, drawn, strict=True):
         assert torch.equal(one.density, other.density) and torch.equal(one.rgb, other.rgb)
     with torch.no_grad():
         exact, reduced = (field.query(*where) for field in (full, half))
-        still = half.query_in_training(*where, generator())
+        still = half.query(*where, generator())
     assert torch.equal(exact.density, trained[0].density) and torch.equal(still.density, trained[0].density)
     assert reduced.density.dtype == reduced.rgb.dtype == torch.float32
     for one, other in ((exact.density, reduced.density), (exact.rgb, reduced.rgb)):

@@ -211,7 +211,7 @@ class FieldOf(GaussianField):
         self._gaussians = gaussians
         self.primitive = "surfels" if gaussians.scales.shape[1] == 2 else "gaussians3d"
 
-    def gaussians(self, camera):
+    def gaussians(self, camera, light=None, generator=None):
         return self._gaussians
 
     def parameter_groups(self):

@@ -36,7 +36,7 @@ class Fog(RadianceField):
         self.density = nn.Parameter(torch.tensor(float(density), dtype=torch.float64))
         self.start = start
 
-    def query(self, positions, directions, camera):
+    def query(self, positions, directions, camera, generator=None):
         beyond = (positions[..., 2] > self.start).to(positions)
         return RadianceSamples(self.density * beyond, positions.new_tensor(COLOR).expand(positions.shape))
 
@@ -75,7 +75,7 @@ class Ball(Fog):
         super().__init__(density)
         self.center, self.asked = torch.tensor(center, dtype=torch.float64), []
 
-    def query(self, positions, directions, camera):
+    def query(self, positions, directions, camera, generator=None):
         self.asked.append(positions.detach())
         inside = ((positions - self.center).norm(dim=-1) < 1.0).to(positions)
         return RadianceSamples(self.density * inside, 0.5 + 0.3 * (positions - self.center).tanh())
@@ -162,7 +162,7 @@ def test_colours_of_the_coarse_level_are_computed_for_its_image_alone():
         def query_density(self, positions, directions, camera):
             return Ball.query(self, positions, directions, camera).density
 
-        def query(self, positions, directions, camera):
+        def query(self, positions, directions, camera, generator=None):
             raise RuntimeError("asked for colours")
 
     camera, field = camera_from(3.0), Levels(Silent())
@@ -177,7 +177,7 @@ def test_samples_behind_an_opaque_surface_are_left_out_in_rendering_and_change_n
     class Wall(Fog):
         asked = 0
 
-        def query(self, positions, directions, camera):
+        def query(self, positions, directions, camera, generator=None):
             self.asked += positions.shape[:2].numel()
             return super().query(positions, directions, camera)
 
@@ -197,7 +197,7 @@ def test_chance_places_samples_in_training_alone():
 
     def drawn(seed, **options):
         renderer, generator = make(**REFINED, **options), torch.Generator().manual_seed(seed)
-        return renderer.render_in_training(field, camera, wants, pixels, generator)["depth_accumulated"]
+        return renderer.render(field, camera, wants, pixels, generator)["depth_accumulated"]
 
     still = make(**REFINED).render(field, camera, wants, pixels)["depth_accumulated"]
     assert torch.equal(still, make(**REFINED, jitter=True).render(field, camera, wants, pixels)["depth_accumulated"])

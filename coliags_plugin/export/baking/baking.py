@@ -184,7 +184,7 @@ def _averaged(
         for index, frame in enumerate(views):
             camera = adjusted_camera(trained, frame)
             with torch.no_grad():
-                gaussians = field.gaussians_in_light(camera, light)
+                gaussians = field.gaussians(camera, light)
             weights = blending_weights(renderer, gaussians, camera)
             averages.add(gaussians, weights, camera)
             if index % every == 0:

@@ -44,7 +44,7 @@ class RoundGaussians(GaussianField):
         field.load_state_dict(state)
         return field
 
-    def gaussians(self, camera):
+    def gaussians(self, camera, light=None, generator=None):
         """The same from everywhere."""
         count = len(self.means)
         rows = torch.arange(count, device=self.means.device)

@@ -310,7 +310,7 @@ def test_fields_that_know_a_lamp_look_different_under_another(run_of, method):
     field, camera = trained.model.field, trained.scene.train[2].camera
     assert field.knows_lamp == (method not in ("scaffold-gs", "3dgs"))
     with torch.no_grad():
-        near, far = (field.gaussians_in_light(camera, FlattenedLight(length, 1.0)).colors for length in (10.0, 60.0))
+        near, far = (field.gaussians(camera, FlattenedLight(length, 1.0)).colors for length in (10.0, 60.0))
     assert torch.equal(near, far) != field.knows_lamp
 
 
@@ -321,7 +321,7 @@ def test_the_lamp_of_the_camera_itself_changes_nothing(run_of, method):
     camera = replace(camera, camera_to_world=camera.camera_to_world.float())
     with torch.no_grad():
         moving = trained.model.field.gaussians(camera)
-        fixed = trained.model.field.gaussians_in_light(camera, LightOfCamera(camera))
+        fixed = trained.model.field.gaussians(camera, LightOfCamera(camera))
     assert torch.equal(moving.means, fixed.means) and torch.equal(moving.opacities, fixed.opacities)
     torch.testing.assert_close(fixed.colors, moving.colors, atol=1e-5, rtol=1e-4)
 
@@ -333,7 +333,7 @@ def test_flattened_light_is_even_over_a_wall(run_of):
     cameras = [frame.camera for frame in run_of("pr-endo").load().scene.train]
     with torch.no_grad():
         near, far = (
-            field.gaussians_in_light(replace(camera, camera_to_world=camera.camera_to_world.float()), light)
+            field.gaussians(replace(camera, camera_to_world=camera.camera_to_world.float()), light)
             for camera in (cameras[0], cameras[-1])
         )
     common = set(near.source_index.tolist()) & set(far.source_index.tolist())
