@@ -4,17 +4,14 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from pathlib import Path
-from typing import ClassVar, Generic
 
 from coliags_plugin.core.jobs import Progress
 from coliags_plugin.core.scenes import Scene
-from coliags_plugin.core.settings import Settings, SettingsT
+from coliags_plugin.core.settings import Configurable, SettingsT
 
 
-class DataManager(ABC, Generic[SettingsT]):
+class DataManager(ABC, Configurable[SettingsT]):
     """Reader of one dataset format: a folder on disk -> :class:`Scene`. Never writes into the dataset."""
-
-    Settings: ClassVar[type[Settings]]
 
     def __init__(self, settings: SettingsT) -> None:
         self.settings = settings

@@ -5,14 +5,14 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar, Generic
+from typing import Any, ClassVar
 
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from coliags_plugin.core.render_output import RenderOutput
 from coliags_plugin.core.scenes import Frame
-from coliags_plugin.core.settings import Settings, SettingsT
+from coliags_plugin.core.settings import Configurable, Settings, SettingsT
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class Comparison:
     true_point_depth: Float[Tensor, "K"] | None = None
 
 
-class Metric(ABC, Generic[SettingsT]):
+class Metric(ABC, Configurable[SettingsT]):
     """One number from a :class:`Comparison`."""
 
     Settings: ClassVar[type[Settings]] = Settings

@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar, Generic, Literal, NamedTuple
+from typing import ClassVar, Literal, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -18,13 +18,12 @@ from coliags_plugin.core.gaussians import Gaussians
 from coliags_plugin.core.json_files import JsonObject
 from coliags_plugin.core.lamps import HeldLight, Lamp
 from coliags_plugin.core.scenes import Scene
-from coliags_plugin.core.settings import Settings, SettingsT
+from coliags_plugin.core.settings import Configurable, SettingsT
 
 
-class Field(nn.Module, ABC, Generic[SettingsT]):
+class Field(nn.Module, ABC, Configurable[SettingsT]):
     """Trainable scene representation: a :class:`GaussianField` or a :class:`RadianceField`."""
 
-    Settings: ClassVar[type[Settings]]
     #: ``gaussians3d``, ``surfels`` or ``radiance``; renderers declare which they support.
     primitive: ClassVar[str]
     #: Elements that strategies add and remove: ``anchors`` or ``gaussians``; ``none`` where the size is fixed.
@@ -214,14 +213,11 @@ class HeadNetworks(NamedTuple):
     mlps: tuple[nn.Sequential, ...]
 
 
-class Head(nn.Module, ABC, Generic[SettingsT]):
+class Head(nn.Module, ABC, Configurable[SettingsT]):
     """Exchangeable decoder within a field, with parameter groups of its own.
 
     Made by ``Head(settings, features, children, generator)``.
     """
-
-    Settings: ClassVar[type[Settings]]
-    settings: SettingsT
 
     #: What decodes anchors: ``"networks"``, kernels that run :meth:`networks`, where they serve the device, else
     #: ``forward``, which gives the same; or ``"forward"``, always that method.

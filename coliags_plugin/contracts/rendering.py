@@ -18,7 +18,7 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.json_files import JsonObject
 from coliags_plugin.core.render_output import RenderOutput
 from coliags_plugin.core.scenes import Scene, View
-from coliags_plugin.core.settings import Settings, SettingsT
+from coliags_plugin.core.settings import Configurable, SettingsT
 
 #: Field that a renderer draws.
 RenderedT = TypeVar("RenderedT", bound=Field, default=Any)
@@ -32,10 +32,9 @@ class Availability:
     reason: str
 
 
-class Renderer(ABC, Generic[SettingsT, RenderedT]):
+class Renderer(ABC, Configurable[SettingsT], Generic[SettingsT, RenderedT]):
     """Field + Camera -> RenderOutput, with declared primitives, outputs and devices that the engine checks."""
 
-    Settings: ClassVar[type[Settings]]
     primitives: ClassVar[frozenset[str]]
     #: Outputs of any primitive; :meth:`outputs_of` says which of one.
     outputs: ClassVar[frozenset[str]]
@@ -114,10 +113,9 @@ class Renderer(ABC, Generic[SettingsT, RenderedT]):
         """
 
 
-class ViewModule(nn.Module, ABC, Generic[SettingsT]):
+class ViewModule(nn.Module, ABC, Configurable[SettingsT]):
     """Per-view module: adjusts the camera before and the output after rendering; may learn parameters per frame."""
 
-    Settings: ClassVar[type[Settings]]
     #: Whether :meth:`shade` depends on where in the image a pixel lies: ``output`` may be some pixels of a view, as an
     #: image of P rows and one column, unless this refuses samplers of pixels.
     whole_image: ClassVar[bool] = False

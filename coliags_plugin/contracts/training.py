@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Generic
+from typing import Any, ClassVar
 from typing import Protocol as TypingProtocol
 
 import torch
@@ -22,7 +22,7 @@ from coliags_plugin.contracts.schedule import Schedule, log_linear
 from coliags_plugin.core.json_files import JsonObject
 from coliags_plugin.core.render_output import RenderOutput
 from coliags_plugin.core.scenes import Target
-from coliags_plugin.core.settings import Settings, SettingsT, refuse_zero_ends
+from coliags_plugin.core.settings import Configurable, Settings, SettingsT, refuse_zero_ends
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,7 @@ class ParameterRows(TypingProtocol):
         """Replace the values of a group and reset their moments. [M, ...]"""
 
 
-class Strategy(ABC, Generic[SettingsT]):
+class Strategy(ABC, Configurable[SettingsT]):
     """Densification and pruning of a field between optimizer steps, with its own counters.
 
     Args:
@@ -145,7 +145,7 @@ class Draw:
     pixels: Int[Tensor, "P 2"] | None = None
 
 
-class Sampler(ABC, Generic[SettingsT]):
+class Sampler(ABC, Configurable[SettingsT]):
     """Sequence of the frames, or pixel batches, that training steps render.
 
     Args:
@@ -210,10 +210,10 @@ class LossSettings(Settings):
 LossSettingsT = TypeVar("LossSettingsT", bound=LossSettings, default=LossSettings)
 
 
-class Loss(ABC, Generic[LossSettingsT]):
+class Loss(ABC, Configurable[LossSettingsT]):
     """One scalar term of the loss; its weight and schedule are settings, applied by the engine."""
 
-    Settings: ClassVar[type[LossSettings]] = LossSettings
+    Settings: ClassVar[type[Settings]] = LossSettings
     #: Attributes of :class:`Target` that at least one training frame must have (``depth``, ``sparse_depth``).
     needs: ClassVar[frozenset[str]] = frozenset()
     #: Whether it depends on neighbouring pixels, so that batches of single pixels cannot be used.

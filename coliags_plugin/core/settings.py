@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar, Generic, get_args
 
 from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 from pydantic_core import InitErrorDetails, PydanticCustomError
@@ -58,6 +58,21 @@ class Settings(BaseModel):
 
 #: Settings of a component's base class.
 SettingsT = TypeVar("SettingsT", bound=Settings, default=Any)
+
+
+class Configurable(Generic[SettingsT]):
+    """Base class of what has options: ``class EdgesLoss(Loss[EdgesSettings])`` names their class, ``Settings``."""
+
+    Settings: ClassVar[type[Settings]]
+    settings: SettingsT
+
+    def __init_subclass__(cls, **options: object) -> None:
+        """Take ``Settings`` from the brackets behind a base class, unless the class sets them itself."""
+        super().__init_subclass__(**options)
+        for base in vars(cls).get("__orig_bases__", ()):
+            for argument in get_args(base):
+                if "Settings" not in vars(cls) and isinstance(argument, type) and issubclass(argument, Settings):
+                    cls.Settings = argument
 
 
 #: Types of the errors whose messages are this package's own, and say all.

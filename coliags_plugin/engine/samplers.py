@@ -43,7 +43,6 @@ class PixelSamplerSettings(Settings):
 class PixelSampler(Sampler[PixelSamplerSettings]):
     """Random pixels of a few frames per step, each frame once per round in random order."""
 
-    Settings: ClassVar[type[Settings]] = PixelSamplerSettings
     whole_images: ClassVar[bool] = False
 
     settings: PixelSamplerSettings

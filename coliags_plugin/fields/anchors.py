@@ -66,7 +66,6 @@ class AnchorField(GaussianField[AnchorFieldSettings]):
         spacing: Of the anchors at the start: median root mean squared distance to the three nearest, scene units. []
     """
 
-    Settings: ClassVar[type[Settings]] = AnchorFieldSettings
     primitive: ClassVar[str] = "gaussians3d"
     elements: ClassVar[str] = "anchors"
     row_parameters: ClassVar[tuple[str, ...]] = ("offsets", "features", "scalings")

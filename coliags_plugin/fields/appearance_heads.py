@@ -107,8 +107,6 @@ class PlainAppearanceSettings(AppearanceSettings):
 class PlainAppearanceHead(MLPAppearanceHead[PlainAppearanceSettings]):
     """Appearance head of Scaffold-GS, optionally with distance as an input (docs/methods.md 3.6)."""
 
-    Settings: ClassVar[type[Settings]] = PlainAppearanceSettings
-
     @property
     def knows_lamp(self) -> bool:
         """True where the distance to the lamp is an input of the MLP."""
@@ -134,7 +132,6 @@ class IMIAAppearanceHead(MLPAppearanceHead[IMIAAppearanceSettings]):
     spread and vignetting merge.
     """
 
-    Settings: ClassVar[type[Settings]] = IMIAAppearanceSettings
     embedded: ClassVar[int] = 1
 
     @property

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any, ClassVar, Literal
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Float
@@ -58,7 +58,6 @@ class AttenuatedAppearanceHead(AppearanceHead[AttenuatedAppearanceSettings]):
         reference: d_0, scene units. []
     """
 
-    Settings: ClassVar[type[Settings]] = AttenuatedAppearanceSettings
     decoding = "networks"
 
     reference: Tensor

@@ -15,7 +15,6 @@ from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.gaussians import Gaussians
 from coliags_plugin.core.lamps import HeldLight
 from coliags_plugin.core.scenes import Scene
-from coliags_plugin.core.settings import Settings
 from coliags_plugin.core.tensors import fit_kernels
 from coliags_plugin.fields import spherical_harmonics
 from coliags_plugin.fields.explicit_field import ExplicitField, ExplicitFieldSettings
@@ -37,7 +36,6 @@ class ExplicitGaussiansSettings(ExplicitFieldSettings):
 class ExplicitGaussians(ExplicitField[ExplicitGaussiansSettings]):
     """Explicit Gaussians whose colours are spherical harmonics of the viewing direction."""
 
-    Settings: ClassVar[type[Settings]] = ExplicitGaussiansSettings
     primitive: ClassVar[str] = "gaussians3d"
     row_parameters: ClassVar[tuple[str, ...]] = (*ExplicitField.row_parameters, "sh0", "shN")
     host_buffers: ClassVar[tuple[str, ...]] = ("degree",)

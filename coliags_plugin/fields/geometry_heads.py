@@ -77,8 +77,6 @@ class IMVEGeometrySettings(PlainGeometrySettings):
 class IMVEGeometryHead(PlainGeometryHead[IMVEGeometrySettings]):
     """Improved geometry Modelling with View Embedding: gamma(v) in place of v (paper, Eq. 7; docs/methods.md 3.4)."""
 
-    Settings: ClassVar[type[Settings]] = IMVEGeometrySettings
-
     @property
     def frequencies(self) -> int:
         """Number of frequencies for the viewing direction: gamma(v) has 63 numbers at ten."""

@@ -19,7 +19,6 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.gaussians import Gaussians, third_axes
 from coliags_plugin.core.lamps import HeldLight, Lamp
 from coliags_plugin.core.scenes import PointCloud, Scene
-from coliags_plugin.core.settings import Settings
 from coliags_plugin.core.tensors import sent
 from coliags_plugin.fields.cook_torrance import Cosines, fresnel, lambert, specular
 from coliags_plugin.fields.explicit_field import ExplicitField, ExplicitFieldSettings
@@ -128,7 +127,6 @@ class LitGaussians(ExplicitField[LitGaussiansSettings]):
         network_on: Whether the network corrects the diffuse reflection. []
     """
 
-    Settings: ClassVar[type[Settings]] = LitGaussiansSettings
     primitive: ClassVar[str] = "gaussians3d"
     lamp_is_apart: ClassVar[bool] = True
     row_parameters: ClassVar[tuple[str, ...]] = (*ExplicitField.row_parameters, "albedos", "roughness", "f0")

@@ -6,7 +6,6 @@ import logging
 from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import ClassVar
 
 import torch
 from jaxtyping import Float
@@ -232,8 +231,6 @@ class ReimNerf(_NetworkLevel, RadianceField[ReimNerfFieldSettings]):
         normalisation: Scene units to the networks' coordinates.
         bounds: Distances between which rays are sampled, scene units. [2]
     """
-
-    Settings: ClassVar[type[Settings]] = ReimNerfFieldSettings
 
     bounds: Tensor
 

@@ -24,18 +24,14 @@ DepthKind = Literal["depth_accumulated", "depth_expected", "depth_median", "inve
 class DepthL1Settings(LossSettings):
     """Options of the L1 depth loss."""
 
-    depth: DepthKind = Field(
-        default="depth_accumulated", description="Which rendered depth is compared; the paper's D is depth_accumulated."
-    )
-    empty_depth: float = Field(
-        default=100.0, gt=0.0, description="inverse_depth_accumulated only: depth of a pixel without Gaussians, mm."
-    )
+    depth: DepthKind = "depth_accumulated"  # rendered depth that is compared; the paper's D is depth_accumulated
+    empty_depth: float = Field(default=100.0, gt=0.0)  # of an empty pixel, mm; inverse_depth_accumulated only
 
 
 class DepthHuberSettings(DepthL1Settings):
     """Options of the Huber depth loss."""
 
-    delta: float = Field(default=0.2, gt=0.0, description="Difference at which the loss becomes linear, scene units.")
+    delta: float = Field(default=0.2, gt=0.0)  # difference at which the loss becomes linear, scene units
 
 
 #: Settings of a depth loss.
@@ -91,8 +87,6 @@ class DepthHuberLoss(DepthLoss[DepthHuberSettings]):
     Used by Gaussian Pancakes and PR-Endo (docs/rivals/gaussian-pancakes.md).
     """
 
-    Settings: ClassVar[type[LossSettings]] = DepthHuberSettings
-
     def penalty(self, differences: Float[Tensor, "H W"]) -> Float[Tensor, "H W"]:
         """Huber's function of them, mm squared."""
         zero = torch.zeros_like(differences)
@@ -102,16 +96,11 @@ class DepthHuberLoss(DepthLoss[DepthHuberSettings]):
 class DistanceL1Settings(LossSettings):
     """Options of the distance loss."""
 
-    depth: Literal["depth_accumulated", "depth_accumulated_coarse"] = Field(
-        default="depth_accumulated", description="Rendered depth whose distance is compared: the final or the coarse."
-    )
-    unit: Literal["scene", "field"] = Field(
-        default="scene", description="Unit of the difference: the scene's, mm in metric data, or the field's own."
-    )
-    share: float = Field(
-        default=1.0, gt=0.0, le=1.0, description="Share of the pixels of each frame that count, drawn once."
-    )
-    seed: int = Field(default=0, ge=0, description="Seed of that draw.")
+    # rendered depth whose distance is compared: the final or the coarse
+    depth: Literal["depth_accumulated", "depth_accumulated_coarse"] = "depth_accumulated"
+    unit: Literal["scene", "field"] = "scene"  # of the difference: the scene's, mm in metric data, or the field's own
+    share: float = Field(default=1.0, gt=0.0, le=1.0)  # of the pixels of each frame that count, drawn once
+    seed: int = Field(default=0, ge=0)  # of that draw
 
 
 class DistanceL1Loss(Loss[DistanceL1Settings]):
@@ -121,7 +110,6 @@ class DistanceL1Loss(Loss[DistanceL1Settings]):
     pixels are drawn depends on ``seed``, frame and pixel only, so it is the same at every step and in a resumed run.
     """
 
-    Settings: ClassVar[type[LossSettings]] = DistanceL1Settings
     needs: ClassVar[frozenset[str]] = frozenset({"depth"})
     trusts_depth: ClassVar[bool] = True
 
@@ -144,17 +132,10 @@ class DistanceL1Loss(Loss[DistanceL1Settings]):
 class EstimatedDepthSettings(LossSettings):
     """Options of the loss against estimated depth."""
 
-    depth: DepthKind = Field(
-        default="depth_accumulated", description="Which rendered depth is compared; depth_median has no gradient."
-    )
-    floor: float = Field(
-        default=0.1, ge=0.0, le=1.0, description="Weight of a pixel whose confidence is lower than this."
-    )
-    delta: float = Field(
-        default=0.05,
-        gt=0.0,
-        description="Huber threshold of the relative difference: smaller ones are squared and divided by twice this.",
-    )
+    depth: DepthKind = "depth_accumulated"  # rendered depth that is compared; depth_median has no gradient
+    floor: float = Field(default=0.1, ge=0.0, le=1.0)  # weight of a pixel whose confidence is lower than this
+    # Huber threshold of the relative difference: smaller ones are squared and divided by twice this
+    delta: float = Field(default=0.05, gt=0.0)
 
 
 class EstimatedDepthLoss(Loss[EstimatedDepthSettings]):
@@ -165,7 +146,6 @@ class EstimatedDepthLoss(Loss[EstimatedDepthSettings]):
     guides weakly, too. Depth without confidence counts as certain.
     """
 
-    Settings: ClassVar[type[LossSettings]] = EstimatedDepthSettings
     needs: ClassVar[frozenset[str]] = frozenset({"depth"})
 
     @property
@@ -189,25 +169,13 @@ class EstimatedDepthLoss(Loss[EstimatedDepthSettings]):
 class SparseDepthSettings(LossSettings):
     """Options of the sparse depth loss."""
 
-    depth: DepthKind = Field(
-        default="depth_expected", description="Which rendered depth is compared; depth_median has no gradient."
-    )
-    huber: float | None = Field(
-        default=None,
-        gt=0.0,
-        description="Huber threshold, of the differences' unit: smaller ones are squared and divided by twice this; "
-        "null: absolute differences.",
-    )
-    relative: bool = Field(
-        default=False,
-        description="Whether differences are divided by the known depth, so that the weight needs no unit of length.",
-    )
-    bound: float | None = Field(
-        default=None,
-        gt=0.0,
-        description="What a point adds at most, of the differences' unit: x becomes bound (1 - exp(-x / bound)), whose "
-        "slope falls from 1 to 0, so that outliers hardly pull; null: x itself.",
-    )
+    depth: DepthKind = "depth_expected"  # rendered depth that is compared; depth_median has no gradient
+    # Huber threshold, of the differences' unit: smaller ones are squared and divided by twice this; null: no threshold
+    huber: float | None = Field(default=None, gt=0.0)
+    relative: bool = False  # differences are divided by the known depth, so that the weight needs no unit of length
+    # what a point adds at most, of the differences' unit: x becomes bound (1 - exp(-x / bound)), whose slope falls from
+    # 1 to 0, so that outliers hardly pull; null: x itself
+    bound: float | None = Field(default=None, gt=0.0)
 
 
 class SparseDepthLoss(Loss[SparseDepthSettings]):
@@ -218,7 +186,6 @@ class SparseDepthLoss(Loss[SparseDepthSettings]):
     valid and have alpha > 0.
     """
 
-    Settings: ClassVar[type[LossSettings]] = SparseDepthSettings
     needs: ClassVar[frozenset[str]] = frozenset({"sparse_depth"})
     whole_image: ClassVar[bool] = True
 

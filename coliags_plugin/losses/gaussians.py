@@ -38,7 +38,6 @@ class AttributeVarianceSettings(LossSettings):
 class AttributeVarianceLoss(Loss[AttributeVarianceSettings]):
     """Variance of a feature channel over the Gaussians drawn, averaged over its components (docs/rivals/pr-endo.md)."""
 
-    Settings: ClassVar[type[LossSettings]] = AttributeVarianceSettings
     needs_splats: ClassVar[bool] = True
 
     def check(self, model: TrainedModel) -> None:
@@ -101,8 +100,6 @@ class SurfaceNormalsLoss(Loss[SurfaceNormalsSettings]):
 
     The choice of the axis is not differentiated (docs/rivals/gaussian-pancakes.md).
     """
-
-    Settings: ClassVar[type[LossSettings]] = SurfaceNormalsSettings
 
     def check(self, model: TrainedModel) -> None:
         """Refuse fields without reference normals."""

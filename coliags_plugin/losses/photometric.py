@@ -19,18 +19,13 @@ from coliags_plugin.core.tensors import masked_mean, weighted_mean, zero_outside
 class PhotometricSettings(LossSettings):
     """Options of the losses between images that can leave out what is not the wall."""
 
-    outliers: float | None = Field(
-        default=None,
-        gt=0.0,
-        description="Multiple of the frame's median residual above which pixels lose weight; null: all count alike.",
-    )
-    outliers_from: int = Field(default=2000, ge=0, description="Step after which they do; scales with the run.")
+    # multiple of the frame's median residual above which pixels lose weight; null: all count alike
+    outliers: float | None = Field(default=None, gt=0.0)
+    outliers_from: int = Field(default=2000, ge=0)  # step after which they do; scales with the run
 
 
 class PhotometricLoss(Loss[PhotometricSettings]):
     """Weighted mean over the valid pixels and channels of a difference between images."""
-
-    Settings: ClassVar[type[LossSettings]] = PhotometricSettings
 
     def mean(self, values: Float[Tensor, "H W 3"], step: TrainingStep) -> Float[Tensor, ""]:
         """Mean of the values, weighted by :func:`wall_weights` once they count."""
@@ -52,15 +47,11 @@ class L1Loss(PhotometricLoss):
 class MSESettings(LossSettings):
     """Options of the squared difference."""
 
-    image: Literal["rgb", "rgb_coarse"] = Field(
-        default="rgb", description="Which rendered image is compared; rgb_coarse is not shaded by view modules."
-    )
+    image: Literal["rgb", "rgb_coarse"] = "rgb"  # which is compared; rgb_coarse is not shaded by view modules
 
 
 class MSELoss(Loss[MSESettings]):
     """Mean squared difference over valid pixels and channels, as of NeRF."""
-
-    Settings: ClassVar[type[LossSettings]] = MSESettings
 
     @property
     def wants(self) -> frozenset[str]:

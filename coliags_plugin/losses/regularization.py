@@ -8,7 +8,6 @@ from typing import ClassVar, Literal
 
 import torch
 from jaxtyping import Bool, Float
-from pydantic import Field
 from torch import Tensor
 
 from coliags_plugin.contracts import Loss, LossSettings, TrainedModel, TrainingStep
@@ -41,7 +40,6 @@ class NormalConsistencyLoss(Loss[NormalConsistencySettings]):
     that are ignored or where nothing was drawn; such pixels enter as 1 (docs/rivals/2dgs.md).
     """
 
-    Settings: ClassVar[type[LossSettings]] = NormalConsistencySettings
     whole_image: ClassVar[bool] = True
 
     @property
@@ -80,7 +78,7 @@ class DistortionLoss(Loss):
 class SmoothGainSettings(LossSettings):
     """Options of the loss on gains."""
 
-    module: str = Field(default="exposure", description="Name of the view module 'gain' in the method config.")
+    module: str = "exposure"  # name of the view module 'gain' in the method config
 
 
 class SmoothGainLoss(Loss[SmoothGainSettings]):
@@ -89,8 +87,6 @@ class SmoothGainLoss(Loss[SmoothGainSettings]):
     That is the squared change of slope over the distance in which it changes; slopes are those between training frames
     that follow each other. 0 with fewer than three.
     """
-
-    Settings: ClassVar[type[LossSettings]] = SmoothGainSettings
 
     def check(self, model: TrainedModel) -> None:
         """Refuse methods without that module."""

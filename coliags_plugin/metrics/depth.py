@@ -64,16 +64,12 @@ class DepthMSE(DepthMetric[SettingsT]):
 class DepthMSEInnerSettings(Settings):
     """Threshold of a depth step, and the width of the margin left out around it."""
 
-    relative_step: float = Field(default=0.12, gt=0.0, description="(max - min) / min of a 3x3 window of true depth.")
-    margin: int = Field(
-        default=2, ge=0, description="Pixels up to this many rows and columns from a step are left out."
-    )
+    relative_step: float = Field(default=0.12, gt=0.0)  # (max - min) / min of a 3x3 window of true depth
+    margin: int = Field(default=2, ge=0)  # pixels up to this many rows and columns from a step are left out
 
 
 class DepthMSEInner(DepthMSE[DepthMSEInnerSettings]):
     """Mean squared error of the pixels away from depth steps, so without silhouettes."""
-
-    Settings: ClassVar[type[Settings]] = DepthMSEInnerSettings
 
     def select(self, truth: Float[Tensor, "H W"], counts: Bool[Tensor, "H W"]) -> Bool[Tensor, "H W"]:
         """Valid pixels further than ``margin`` from any depth step."""
@@ -125,13 +121,12 @@ class DepthAbsRel(DepthMetric):
 class SparseDepthErrorSettings(Settings):
     """Quantile of the errors."""
 
-    quantile: float = Field(default=0.5, ge=0.0, le=1.0, description="0.5: the median.")
+    quantile: float = Field(default=0.5, ge=0.0, le=1.0)  # 0.5: the median
 
 
 class SparseDepthError(Metric[SparseDepthErrorSettings]):
     """A quantile of |D(p) - z| / z over a frame's points p of known depth z, in percent."""
 
-    Settings: ClassVar[type[Settings]] = SparseDepthErrorSettings
     higher_is_better: ClassVar[bool] = False
     unit: ClassVar[str] = "%"
 

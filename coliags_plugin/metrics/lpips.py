@@ -18,7 +18,6 @@ from typing import ClassVar, Literal
 
 import torch
 from jaxtyping import Bool, Float
-from pydantic import Field
 from torch import Tensor, nn
 from torch.nn.functional import adaptive_avg_pool2d
 
@@ -62,13 +61,10 @@ _SMALLEST = 32
 class LPIPSSettings(Settings):
     """Backbone and input range of LPIPS; values of different variants are not comparable."""
 
-    net: Literal["vgg", "alex", "squeeze"] = Field(default="vgg", description="The backbone.")
-    input_range: Literal["zero-one", "minus-one-one"] = Field(
-        default="zero-one",
-        description="Range of the network's input. LPIPS was trained on minus-one-one; the splatting papers, this one "
-        "included, feed [0, 1] unmapped.",
-    )
-    weights: str | None = Field(default=None, description="A folder searched for weights before the default ones.")
+    net: Literal["vgg", "alex", "squeeze"] = "vgg"  # the backbone
+    # of the network, which was trained on minus-one-one; the splatting papers, this one included, feed [0, 1] unmapped
+    input_range: Literal["zero-one", "minus-one-one"] = "zero-one"
+    weights: str | None = None  # a folder searched for weights before the default ones
 
 
 class LPIPS(Metric[LPIPSSettings]):
@@ -78,7 +74,6 @@ class LPIPS(Metric[LPIPSSettings]):
     valid ones, so the content of an ignored pixel has no influence.
     """
 
-    Settings: ClassVar[type[Settings]] = LPIPSSettings
     higher_is_better: ClassVar[bool] = False
     unit: ClassVar[str] = ""
 

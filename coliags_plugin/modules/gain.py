@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
-from typing import ClassVar, Literal
+from typing import Literal
 
 import torch
 from jaxtyping import Float, Int
@@ -161,8 +161,6 @@ class FrameGain(ViewModule[FrameGainSettings]):
         fitted: Fitted logarithm; 0 where none is. [F, C]
         rate: Share of the learning rate. []
     """
-
-    Settings: ClassVar[type[Settings]] = FrameGainSettings
 
     fitted: Tensor
     rate: Tensor

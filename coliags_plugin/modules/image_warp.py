@@ -37,7 +37,6 @@ class ImageWarp(ViewModule[ImageWarpSettings]):
     Held-out frames of the video are displaced as the training frames around them; free cameras are not.
     """
 
-    Settings: ClassVar[type[Settings]] = ImageWarpSettings
     whole_image: ClassVar[bool] = True
 
     def __init__(self, settings: ImageWarpSettings, scene: Scene) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import ClassVar, Literal
+from typing import Literal
 
 import torch
 from jaxtyping import Float
@@ -41,8 +41,6 @@ class PoseCorrection(ViewModule[PoseCorrectionSettings]):
     change slowly; no pixel of theirs is used. Views beside the video take the correction of the nearest training
     camera. Free cameras stay.
     """
-
-    Settings: ClassVar[type[Settings]] = PoseCorrectionSettings
 
     def __init__(self, settings: PoseCorrectionSettings, scene: Scene) -> None:
         super().__init__()

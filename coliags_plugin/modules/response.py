@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import ClassVar
 
 import torch
 from jaxtyping import Float
@@ -42,8 +41,6 @@ class CameraResponse(ViewModule[ResponseSettings]):
     Attributes:
         log_slope: Logarithm of the slope of every segment. [K]
     """
-
-    Settings: ClassVar[type[Settings]] = ResponseSettings
 
     def __init__(self, settings: ResponseSettings) -> None:
         super().__init__()

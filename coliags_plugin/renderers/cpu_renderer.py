@@ -37,7 +37,6 @@ _IMAGES = {
 class CpuRenderer(SplattingRenderer[CutSettings]):
     """CPU renderer of float32 3D Gaussians and surfels: ``docs/rendering.md``, section "The cpu backend"."""
 
-    Settings = CutSettings
     devices: ClassVar[frozenset[str]] = frozenset({"cpu"})
     name: ClassVar[str] = "cpu"
 

@@ -30,7 +30,6 @@ class TorchRendererSettings(CutSettings):
 class TorchRenderer(SplattingRenderer[TorchRendererSettings]):
     """Reference renderer of 3D Gaussians and surfels, on any device, in float32 or float64: ``docs/rendering.md``."""
 
-    Settings = TorchRendererSettings
     devices: ClassVar[frozenset[str]] = frozenset({"cpu", "cuda"})
     name: ClassVar[str] = "torch"
 

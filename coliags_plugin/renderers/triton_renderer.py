@@ -20,7 +20,6 @@ from coliags_plugin.renderers.tiles import TileGrid
 class TritonRenderer(SplattingRenderer[CutSettings]):
     """Renderer of float32 3D Gaussians and surfels on CUDA: ``docs/rendering.md``, section "The triton backend"."""
 
-    Settings = CutSettings
     devices: ClassVar[frozenset[str]] = frozenset({"cuda"})
     name: ClassVar[str] = "triton"
 

@@ -73,7 +73,6 @@ class VolumeRendererSettings(Settings):
 class VolumeRenderer(Renderer[VolumeRendererSettings, RadianceField]):
     """Volume renderer of radiance fields, for whole images or selected pixels (docs/rendering.md)."""
 
-    Settings: ClassVar[type[Settings]] = VolumeRendererSettings
     primitives: ClassVar[frozenset[str]] = frozenset({"radiance"})
     outputs: ClassVar[frozenset[str]] = _COMPOSITED | {name + _COARSE for name in _COMPOSITED} | {"ray_lengths"}
     devices: ClassVar[frozenset[str]] = frozenset({"cpu", "cuda"})

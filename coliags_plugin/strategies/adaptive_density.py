@@ -46,7 +46,6 @@ class AdaptiveDensity(Strategy[AdaptiveDensitySettings]):
     The field is an ``ExplicitField``, or one with its means, scales, quaternions and opacities.
     """
 
-    Settings: ClassVar[type[Settings]] = AdaptiveDensitySettings
     serves: ClassVar[frozenset[str] | None] = frozenset({"gaussians"})
     counters: ClassVar[tuple[str, ...]] = ("gradient_sum", "drawn", "largest_radius")
 

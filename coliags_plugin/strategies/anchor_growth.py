@@ -41,7 +41,6 @@ class AnchorGrowth(Strategy[AnchorGrowthSettings]):
     ``AnchorField``, or one with its anchors, offsets, features, scalings, spacing, voxel size and child positions.
     """
 
-    Settings: ClassVar[type[Settings]] = AnchorGrowthSettings
     serves: ClassVar[frozenset[str] | None] = frozenset({"anchors"})
     counters: ClassVar[tuple[str, ...]] = ("opacity_sum", "seen", "gradient_sum", "drawn")
 
