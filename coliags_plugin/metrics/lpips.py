@@ -27,7 +27,7 @@ from coliags_plugin.core.files import user_path
 from coliags_plugin.core.settings import Settings
 from coliags_plugin.core.tensors import zero_outside
 from coliags_plugin.core.text_files import unreadable
-from coliags_plugin.metrics.image import require_image
+from coliags_plugin.metrics.pixels import require_image
 
 _log = logging.getLogger(__name__)
 

@@ -15,7 +15,7 @@ from coliags_plugin.api.scenes import load_scene
 from coliags_plugin.config.components import make_component
 from coliags_plugin.core.photometry import Cavity, fit_light
 from coliags_plugin.core.scenes import Frame, PointCloud
-from coliags_plugin.modules.gain import FrameGain
+from coliags_plugin.modules.exposure import FrameGain
 from coliags_plugin.phantom.generate import generate
 from coliags_plugin.phantom.settings import PhantomSettings
 from tests.scenes import camera_at, wall_color, wall_scene

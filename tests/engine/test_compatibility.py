@@ -12,8 +12,8 @@ from coliags_plugin.core.errors import InputError, NothingDrawnError
 from coliags_plugin.core.provenance import Provenance
 from coliags_plugin.core.scenes import SparseDepth
 from coliags_plugin.engine.compatibility import _check_data, _check_sampler
-from coliags_plugin.losses.photometric import L1Loss
-from coliags_plugin.modules.gain import FrameGain
+from coliags_plugin.losses.target import L1Loss
+from coliags_plugin.modules.exposure import FrameGain
 from coliags_plugin.renderers.splatting import ChosenRenderer
 from coliags_plugin.renderers.volume_renderer import VolumeRenderer
 from tests.engine.test_trainer import MODULES, make_trainer

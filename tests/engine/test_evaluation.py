@@ -24,7 +24,7 @@ from coliags_plugin.engine.evaluator import evaluate
 from coliags_plugin.engine.scoring import EvaluatedSet, Scorer
 from coliags_plugin.engine.trained import load_trained
 from coliags_plugin.engine.truth import match_truth
-from coliags_plugin.metrics.image import PSNR
+from coliags_plugin.metrics.pixels import PSNR
 from coliags_plugin.metrics.protocols import PaperProtocol
 from coliags_plugin.results.hashing import code_key, result_key
 from coliags_plugin.results.reading import RESULT_FILE, means_summary, per_frame_table, read_result

@@ -12,8 +12,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from coliags_plugin.fields import anchors
-from coliags_plugin.fields.appearance_heads import PlainAppearanceHead
-from coliags_plugin.fields.geometry_heads import PlainGeometryHead
+from coliags_plugin.fields.heads import PlainAppearanceHead, PlainGeometryHead
 from coliags_plugin.fields.points import DRAWN_SIGMAS, spheres_in_frustum
 from tests.fields.made import make_field
 from tests.scenes import camera_at

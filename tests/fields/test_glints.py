@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from coliags_plugin.config.components import make_component
 from coliags_plugin.contracts import SeenAnchors
 from coliags_plugin.core.lamps import FlattenedLight, LightOfCamera
-from coliags_plugin.fields.appearance_heads import MAX_TILT, WIDTHS, GlintAppearanceHead, tangent_components
 from coliags_plugin.fields.attenuation import MAX_OFFSET, AttenuatedAppearanceHead
+from coliags_plugin.fields.heads import MAX_TILT, WIDTHS, GlintAppearanceHead, tangent_components
 from coliags_plugin.fields.mlp import embedded_inputs
 from tests.fields.made import make_field
 from tests.scenes import camera_at

@@ -17,8 +17,17 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.lamps import Lamp
 from coliags_plugin.core.scenes import PointCloud
 from coliags_plugin.fields import lit_gaussians
-from coliags_plugin.fields.cook_torrance import Cosines, fresnel, lambert, specular
-from coliags_plugin.fields.lit_gaussians import _ROWS, GAMMA, PINK, THICKNESS, DiffuseNetwork
+from coliags_plugin.fields.lit_gaussians import (
+    _ROWS,
+    GAMMA,
+    PINK,
+    THICKNESS,
+    Cosines,
+    DiffuseNetwork,
+    fresnel,
+    lambert,
+    specular,
+)
 from coliags_plugin.renderers.torch_renderer import render_gaussians
 from tests.fields.made import colored_wall, make_field
 from tests.scenes import camera_at, wall_scene

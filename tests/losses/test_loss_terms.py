@@ -12,7 +12,7 @@ from coliags_plugin.core.render_output import RenderOutput
 from coliags_plugin.core.scenes import SparseDepth
 from coliags_plugin.core.ssim import ssim
 from coliags_plugin.engine.model import Model
-from coliags_plugin.modules.gain import FrameGain
+from coliags_plugin.modules.exposure import FrameGain
 from tests.fields.made import make_field
 from tests.losses import terms
 from tests.losses.terms import make, make_output

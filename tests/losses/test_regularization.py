@@ -16,7 +16,7 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.gaussians import rotation_matrices
 from coliags_plugin.engine.model import Model
 from coliags_plugin.losses.regularization import depth_normals
-from coliags_plugin.modules.gain import FrameGain
+from coliags_plugin.modules.exposure import FrameGain
 from coliags_plugin.renderers.torch_renderer import render_gaussians
 from tests.fields.made import make_field
 from tests.losses import terms

@@ -17,7 +17,7 @@ from coliags_plugin.contracts import Comparison
 from coliags_plugin.core.errors import UnavailableError
 from coliags_plugin.core.scenes import SparseDepth
 from coliags_plugin.engine.scoring import Scorer
-from coliags_plugin.metrics.depth import depth_steps, dilated
+from coliags_plugin.metrics.pixels import depth_steps, dilated
 from tests.losses.terms import make_output
 from tests.metrics.made import depths, images, make
 from tests.scenes import plain_frame as make_frame

@@ -18,8 +18,7 @@ from coliags_plugin.core.render_output import RenderOutput
 from coliags_plugin.core.scenes import View
 from coliags_plugin.engine.run_folder import RunFolder
 from coliags_plugin.engine.trainer import Trainer
-from coliags_plugin.modules.gain import FrameGain, FrameGainSettings
-from coliags_plugin.modules.response import CameraResponse, ResponseSettings
+from coliags_plugin.modules.exposure import CameraResponse, FrameGain, FrameGainSettings, ResponseSettings
 from tests.pretended_cuda import PretendedCuda
 from tests.scenes import wall_scene
 

@@ -18,8 +18,7 @@ from coliags_plugin.core.render_output import RenderOutput
 from coliags_plugin.core.scenes import PointCloud, Scene, View
 from coliags_plugin.engine.run_folder import RunFolder
 from coliags_plugin.engine.trainer import Trainer
-from coliags_plugin.modules.image_warp import ImageWarp, ImageWarpSettings
-from coliags_plugin.modules.pose_correction import PoseCorrection, PoseCorrectionSettings
+from coliags_plugin.modules.motion import ImageWarp, ImageWarpSettings, PoseCorrection, PoseCorrectionSettings
 from tests.pretended_cuda import PretendedCuda
 from tests.scenes import wall_scene
 from tests.textured_tube import tube_frames

@@ -7,7 +7,7 @@ import torch
 
 from coliags_plugin.config.components import make_component
 from coliags_plugin.contracts import Schedule
-from coliags_plugin.strategies.anchor_growth import one_per_free_cell
+from coliags_plugin.strategies.densification import one_per_free_cell
 from tests.fields.made import make_field
 from tests.strategies.steps import after_backward, stepped_optimizers
 from tests.strategies.steps import make_output as drawn_output
