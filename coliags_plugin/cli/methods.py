@@ -170,8 +170,14 @@ class WeightsCommand:
 
     def run(self) -> None:
         """Install what is missing, and print where the weights of each net are."""
-        from coliags_plugin.metrics.lpips import DEFAULT_NETS, WEIGHTS_VARIABLE, find_weights, search
-        from coliags_plugin.metrics.lpips_install import SOURCES, install
+        from coliags_plugin.metrics.lpips import (
+            DEFAULT_NETS,
+            SOURCES,
+            WEIGHTS_VARIABLE,
+            find_weights,
+            install,
+            searched_folders,
+        )
 
         nets = DEFAULT_NETS if self.net is None else tuple(SOURCES) if self.net == "all" else (self.net,)
         folder = None if self.folder is None else self.folder.resolve()
@@ -181,5 +187,5 @@ class WeightsCommand:
             print(f"LPIPS {net}: backbone {backbone}, linear heads {heads}")
         if not written:
             print("Everything was there already.")
-        if folder is not None and any(search(net) != find_weights(net, folder) for net in nets):
+        if folder is not None and folder not in searched_folders():
             print(f"Set {WEIGHTS_VARIABLE}={folder} for LPIPS to find them.")

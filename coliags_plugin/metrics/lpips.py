@@ -1,8 +1,8 @@
-"""LPIPS, a learned perceptual distance between two images: the metric, its networks and the search for their weights.
+"""LPIPS, a learned perceptual distance between two images: the metric, its networks and their weights.
 
 Zhang et al. 2018, "The Unreasonable Effectiveness of Deep Features as a Perceptual Metric", in plain torch. The
 backbones carry torchvision's layer numbering (``vgg16``, ``alexnet`` and ``squeezenet1_1``, their ``.features``), so
-weights published for those load as they are. Only ``coliags weights lpips`` downloads them (``lpips_install.py``).
+weights published for those load as they are. Only :func:`install`, of ``coliags weights lpips``, downloads.
 """
 
 from __future__ import annotations
@@ -10,9 +10,10 @@ from __future__ import annotations
 import logging
 import os
 import pickle
-from collections.abc import Iterable, Iterator, Mapping
+import shutil
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import lru_cache
-from importlib.util import find_spec
 from pathlib import Path
 from typing import ClassVar, Literal
 
@@ -22,8 +23,9 @@ from torch import Tensor, nn
 from torch.nn.functional import adaptive_avg_pool2d
 
 from coliags_plugin.contracts import Comparison, Metric
+from coliags_plugin.core import __version__
 from coliags_plugin.core.errors import InputError, UnavailableError
-from coliags_plugin.core.files import user_path
+from coliags_plugin.core.files import atomic_path, file_sha256, user_path
 from coliags_plugin.core.settings import Settings
 from coliags_plugin.core.tensors import zero_outside
 from coliags_plugin.core.text_files import unreadable
@@ -36,11 +38,11 @@ WEIGHTS_VARIABLE = "COLIAGS_LPIPS_WEIGHTS"
 #: The nets of the protocols' metrics.
 DEFAULT_NETS = ("vgg", "squeeze")
 
-#: File names of torchvision's weights in torch's download folder; the second names are older copies of the same.
-BACKBONE_FILES: dict[str, tuple[str, ...]] = {
-    "vgg": ("vgg16-397923af.pth",),
-    "alex": ("alexnet-owt-7be5be79.pth", "alexnet-owt-4df8aa71.pth"),
-    "squeeze": ("squeezenet1_1-b8a52dc0.pth", "squeezenet1_1-f364aa15.pth"),
+#: File names of torchvision's weights in torch's download folder.
+BACKBONE_FILES = {
+    "vgg": "vgg16-397923af.pth",
+    "alex": "alexnet-owt-7be5be79.pth",
+    "squeeze": "squeezenet1_1-b8a52dc0.pth",
 }
 
 #: The layers after which features are compared (each the ReLU of a block), and how many channels they have there.
@@ -224,14 +226,12 @@ class Fire(nn.Module):
 def find_weights(net: str, folder: str | Path | None = None) -> tuple[Path, Path]:
     """Paths of the backbone and linear head weights.
 
-    Searched in ``folder``, then in the folder that ``COLIAGS_LPIPS_WEIGHTS`` names, then where ``torch.hub`` keeps
-    downloads, and the heads also in an installed ``lpips`` package. A backbone is a file under torchvision's name, or
-    any ``.pth`` with the net's name and "backbone" in its own; heads are ``{net}.pth`` or ``lpips_{net}.pth``, directly
-    or in ``v0.1/``. Where one is missing, UnavailableError names it and the command that installs it.
+    Searched in :func:`searched_folders`. Where one is missing, UnavailableError names it and the command that installs
+    it.
     """
-    backbone, heads = search(net, folder)
+    backbone, heads = weights_in(net, searched_folders(folder))
     if backbone is None or heads is None:
-        names = {f"backbone ({BACKBONE_FILES[net][0]})": backbone, f"linear heads (v0.1/{net}.pth)": heads}
+        names = {f"backbone ({BACKBONE_FILES[net]})": backbone, f"linear heads (v0.1/{net}.pth)": heads}
         missing = [name for name, file in names.items() if file is None]
         command = "coliags weights lpips" + ("" if net in DEFAULT_NETS else f" --net {net}")
         # Recorded with results, which are to be the same on every machine: no folders here.
@@ -241,17 +241,25 @@ def find_weights(net: str, folder: str | Path | None = None) -> tuple[Path, Path
     return backbone, heads
 
 
-def search(net: str, folder: str | Path | None = None) -> tuple[Path | None, Path | None]:
-    """Backbone and linear heads where :func:`find_weights` looks; None for what is missing."""
-    backbone, heads = weights_in(net, searched_folders(folder))
-    return backbone, heads or weights_in(net, _package_folders())[1]
+def searched_folders(folder: str | Path | None = None) -> list[Path]:
+    """Folders in which weights are searched for: this one, that of ``COLIAGS_LPIPS_WEIGHTS``, and torch's downloads."""
+    named = [user_path(path) for path in (folder, os.environ.get(WEIGHTS_VARIABLE)) if path]
+    return [*named, default_folder()]
 
 
-def weights_in(net: str, folders: Iterable[Path]) -> tuple[Path | None, Path | None]:
-    """Backbone and linear heads in the first of some folders that has them; None for what is missing."""
-    folders = list(folders)
-    backbone = next((file for folder in folders for file in _backbones(net, folder)), None)
-    return backbone, next((file for folder in folders for file in _heads(net, folder)), None)
+def weights_in(net: str, folders: Sequence[Path]) -> tuple[Path | None, Path | None]:
+    """Backbone and linear heads in the first of some folders that has them; None for what is missing.
+
+    A backbone is a file under torchvision's name, or any ``.pth`` with the net's name and "backbone" in its own; heads
+    are ``{net}.pth``, directly or in ``v0.1/``.
+    """
+    backbones = (
+        file
+        for folder in folders
+        for file in (folder / BACKBONE_FILES[net], *sorted(folder.glob(f"*{net}*backbone*.pth")))
+    )
+    heads = (folder / name for folder in folders for name in (f"{net}.pth", f"v0.1/{net}.pth"))
+    return next(filter(Path.is_file, backbones), None), next(filter(Path.is_file, heads), None)
 
 
 def default_folder() -> Path:
@@ -279,31 +287,6 @@ def load_network(net: str, backbone: Path, heads: Path) -> LPIPSNetwork:
         raise UnavailableError(f"{backbone} does not hold the backbone of LPIPS {net}") from error
 
 
-def searched_folders(folder: str | Path | None = None) -> Iterator[Path]:
-    """Folders in which weights are searched for, in order; heads also in an installed ``lpips`` package."""
-    for named in (folder, os.environ.get(WEIGHTS_VARIABLE)):
-        if named:
-            yield user_path(named)
-    yield default_folder()
-
-
-def _package_folders() -> Iterator[Path]:
-    spec = find_spec("lpips")
-    for location in (spec.submodule_search_locations or ()) if spec else ():
-        yield Path(location) / "weights"
-
-
-def _backbones(net: str, folder: Path) -> Iterator[Path]:
-    exact = (folder / name for name in BACKBONE_FILES[net])
-    alike = (file for file in sorted(folder.glob("*backbone*.pth")) if net in file.name)
-    yield from (file for file in (*exact, *alike) if file.is_file())
-
-
-def _heads(net: str, folder: Path) -> Iterator[Path]:
-    names = (f"{net}.pth", f"v0.1/{net}.pth", f"lpips_{net}.pth", f"v0.1/lpips_{net}.pth")
-    yield from (file for file in (folder / name for name in names) if file.is_file())
-
-
 def _read(file: Path) -> dict[str, Tensor]:
     try:
         state = torch.load(file, map_location="cpu", weights_only=True)
@@ -312,3 +295,119 @@ def _read(file: Path) -> dict[str, Tensor]:
     if not isinstance(state, dict) or not all(isinstance(value, Tensor) for value in state.values()):
         raise UnavailableError(f"{file} does not hold a table of tensors")
     return state
+
+
+# --- installation of weights ----------------------------------------------------------------------------------------
+
+#: Without any byte for so long, a connection counts as lost, seconds.
+_TIMEOUT = 30.0
+
+
+@dataclass(frozen=True)
+class Published:
+    """One published file: its address, its path in the folder of weights, and its SHA-256 or the first digits of it."""
+
+    url: str
+    path: str
+    sha256: str
+
+    def check(self, file: Path, source: object, do: str) -> None:
+        """Refuse a file with another checksum (InputError)."""
+        digest = file_sha256(file)
+        if not digest.startswith(self.sha256):
+            raise InputError(f"{source} has the SHA-256 {digest}", f"{self.sha256}, of {self.url}", do)
+
+
+def _published(net: str, heads_sha256: str) -> tuple[Published, Published]:
+    """Torchvision's backbone, and linear heads from the repository of LPIPS's authors, at commit 082bb24.
+
+    The digits in a backbone's name begin its checksum; torch checks no more than these either.
+    """
+    name = BACKBONE_FILES[net]
+    digits = name.removesuffix(".pth").rpartition("-")[2]
+    repository = "https://raw.githubusercontent.com/richzhang/PerceptualSimilarity/master/lpips/weights"
+    path = f"v0.1/{net}.pth"
+    heads = Published(f"{repository}/{path}", path, heads_sha256)
+    return Published(f"https://download.pytorch.org/models/{name}", name, digits), heads
+
+
+#: Net -> backbone and linear heads.
+SOURCES: dict[str, tuple[Published, Published]] = {
+    "vgg": _published("vgg", "a78928a0af1e5f0fcb1f3b9e8f8c3a2a5a3de244d830ad5c1feddc79b8432868"),
+    "alex": _published("alex", "df73285e35b22355a2df87cdb6b70b343713b667eddbda73e1977e0c860835c0"),
+    "squeeze": _published("squeeze", "4a5350f23600cb79923ce65bb07cbf57dca461329894153e05a1346bd531cf76"),
+}
+
+
+def install(nets: Sequence[str], folder: Path | None, origin: Path | None) -> list[Path]:
+    """Install the weights of some nets where they are missing, see that their networks load, and name the new files.
+
+    Without a folder to look in and install to, they are looked for wherever LPIPS does, and installed where
+    ``torch.hub`` keeps downloads. Without an ``origin`` to copy from they are downloaded; nothing is copied unless all
+    that are missing are in it.
+    """
+    if origin is not None and not origin.is_dir():
+        raise InputError(f"`from_folder={origin}` is not a folder", "a folder with LPIPS weights")
+    missing = _missing(nets, folder)
+    target = folder or default_folder()
+    written = _download(missing, target) if origin is None else _copy(missing, origin, target)
+    for net in nets:
+        try:
+            load_network(net, *find_weights(net, folder))
+        except UnavailableError as error:
+            raise InputError(
+                str(error), "the published weights", "Remove that file and run the command again"
+            ) from error
+    return written
+
+
+def _missing(nets: Sequence[str], folder: Path | None) -> list[tuple[str, int]]:
+    """Net and index in its pair of every file that is not there, linear heads first; warns of unknown ones there."""
+    missing = []
+    for net in nets:
+        files = weights_in(net, searched_folders() if folder is None else [folder])
+        for index, file in enumerate(files):
+            if file is None:
+                missing.append((net, index))
+            elif not (digest := file_sha256(file)).startswith(SOURCES[net][index].sha256):
+                _log.warning("%s is not the published file: its SHA-256 is %s", file, digest)
+    return sorted(missing, key=lambda item: -item[1])
+
+
+def _download(missing: Sequence[tuple[str, int]], target: Path) -> list[Path]:
+    """Fetch files by HTTP, through the proxy of ``HTTPS_PROXY`` where that is set."""
+    import pooch
+    import requests
+
+    files = [SOURCES[net][index] for net, index in missing]
+    # Some content networks refuse a library's own name.
+    fetch = pooch.HTTPDownloader(timeout=_TIMEOUT, headers={"User-Agent": f"coliags_plugin/{__version__}"})
+    for number, file in enumerate(files):
+        urls = ", ".join(left.url for left in files[number:])
+        otherwise = f"On a machine with a connection download {urls}, and pass `from_folder=FOLDER` with them here"
+        _log.info("download %s", file.url)
+        with atomic_path(target / file.path) as path:
+            try:
+                fetch(file.url, path, None)
+            except requests.RequestException as error:
+                raise InputError(f"cannot download {file.url}: {error}", "", otherwise) from error
+            file.check(path, file.url, f"Perhaps a proxy answered in the server's place. {otherwise}")
+    return [target / file.path for file in files]
+
+
+def _copy(missing: Sequence[tuple[str, int]], origin: Path, target: Path) -> list[Path]:
+    files = [(SOURCES[net][index], weights_in(net, [origin])[index]) for net, index in missing]
+    lacking = [published for published, file in files if file is None]
+    if lacking:
+        raise InputError(
+            f"{origin} has no {', '.join(published.path for published in lacking)}",
+            "",
+            f"Download {', '.join(published.url for published in lacking)} into it, or choose another `net`",
+        )
+    copies = [(file, published) for published, file in files if file is not None]
+    for file, published in copies:
+        published.check(file, file, f"Download {published.url} again")
+    for file, published in copies:
+        with atomic_path(target / published.path) as path:
+            shutil.copyfile(file, path)
+    return [target / published.path for _, published in copies]

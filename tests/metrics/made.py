@@ -79,5 +79,5 @@ def lay_out(folder, net, heads="v0.1/{}.pth"):
     """Lay out weights as torchvision's downloads lie: the classifier too, under its published name."""
     (folder / heads.format(net)).parent.mkdir(parents=True, exist_ok=True)
     state = random_backbone(net, "features.") | {"classifier.0.weight": torch.zeros(2, 2)}
-    torch.save(state, folder / lpips.BACKBONE_FILES[net][0])
+    torch.save(state, folder / lpips.BACKBONE_FILES[net])
     torch.save(random_heads(net), folder / heads.format(net))

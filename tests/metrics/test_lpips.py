@@ -98,7 +98,7 @@ def test_building_a_network_draws_no_random_numbers(pair):
 # ------------------------------------------------------------------------------------------------- finding the weights
 
 
-@pytest.mark.parametrize("heads", ["{}.pth", "v0.1/{}.pth", "lpips_{}.pth"])
+@pytest.mark.parametrize("heads", ["{}.pth", "v0.1/{}.pth"])
 def test_a_named_folder_comes_before_the_environment_s(heads, nowhere, monkeypatch):
     lay_out(nowhere / "first", "alex", heads)
     lay_out(nowhere / "second", "alex", heads)
@@ -107,20 +107,6 @@ def test_a_named_folder_comes_before_the_environment_s(heads, nowhere, monkeypat
     backbone, linear = lpips.find_weights("alex", str(nowhere / "first"))
     assert backbone.parent == nowhere / "first"
     assert linear == nowhere / "first" / heads.format("alex")
-
-
-def test_an_installed_lpips_package_lends_its_heads_without_being_imported(nowhere, monkeypatch, tmp_path):
-    package = tmp_path / "site" / "lpips"
-    lay_out(package / "weights", "alex")
-    (package / "__init__.py").write_text("raise RuntimeError('imported')")
-    (package / "weights" / lpips.BACKBONE_FILES["alex"][0]).rename(tmp_path / "my-alex-backbone.pth")
-    monkeypatch.undo()
-    monkeypatch.setenv("TORCH_HOME", str(tmp_path / "torch"))
-    monkeypatch.delenv(lpips.WEIGHTS_VARIABLE, raising=False)
-    monkeypatch.syspath_prepend(str(tmp_path / "site"))
-    backbone, heads = lpips.find_weights("alex", str(tmp_path))
-    assert backbone == tmp_path / "my-alex-backbone.pth"
-    assert heads == package / "weights" / "v0.1" / "alex.pth"
 
 
 def test_missing_weights_say_what_and_how_to_get_it(nowhere, pair):
@@ -140,7 +126,7 @@ def test_missing_weights_say_what_and_how_to_get_it(nowhere, pair):
 def test_weights_that_do_not_fit_name_the_file(damage, nowhere, pair):
     folder = nowhere / damage.replace(" ", "-")
     lay_out(folder, "squeeze")
-    backbone, heads = folder / lpips.BACKBONE_FILES["squeeze"][0], folder / "v0.1" / "squeeze.pth"
+    backbone, heads = folder / lpips.BACKBONE_FILES["squeeze"], folder / "v0.1" / "squeeze.pth"
     culprit = heads if "heads" in damage else backbone
     if damage == "truncated":
         backbone.write_bytes(backbone.read_bytes()[:1000])

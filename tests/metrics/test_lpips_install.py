@@ -17,20 +17,22 @@ import torch
 
 from coliags_plugin.config.registry import REGISTRIES
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.metrics import lpips_install
+from coliags_plugin.metrics import lpips
 from coliags_plugin.metrics.lpips import (
     BACKBONE_FILES,
     DEFAULT_NETS,
+    SOURCES,
     LPIPSNetwork,
+    Published,
     find_weights,
+    install,
 )
-from coliags_plugin.metrics.lpips_install import SOURCES, Published, install
 from tests.commands import refused, run
 from tests.metrics.made import lay_out, make, random_backbone, random_heads
 
 NETS = ("alex", "squeeze")
-ALEX = (BACKBONE_FILES["alex"][0], "v0.1/alex.pth")
-SQUEEZE = (BACKBONE_FILES["squeeze"][0], "v0.1/squeeze.pth")
+ALEX = (BACKBONE_FILES["alex"], "v0.1/alex.pth")
+SQUEEZE = (BACKBONE_FILES["squeeze"], "v0.1/squeeze.pth")
 EVERYTHING = sorted((*ALEX, *SQUEEZE))
 
 
@@ -84,7 +86,7 @@ def server(made, cache, monkeypatch):
         state.url = f"http://127.0.0.1:{server.server_port}"
         for net, paths in zip(NETS, (ALEX, SQUEEZE), strict=True):
             state.files |= {f"/{path}": (made / path).read_bytes() for path in paths}
-            pair = (Published(f"{state.url}/{path}", {sha256(made / path): path}) for path in paths)
+            pair = (Published(f"{state.url}/{path}", path, sha256(made / path)) for path in paths)
             monkeypatch.setitem(SOURCES, net, tuple(pair))
         yield state
         server.shutdown()
@@ -118,8 +120,8 @@ def test_only_what_is_missing_is_fetched(server, cache, made, monkeypatch):
     (other / "v0.1").mkdir(parents=True)
     (other / "v0.1" / "alex.pth").write_bytes((made / "v0.1" / "alex.pth").read_bytes())
     monkeypatch.setenv("COLIAGS_LPIPS_WEIGHTS", str(other))
-    assert install(["alex"], None, None) == [cache / BACKBONE_FILES["alex"][0]]
-    assert find_weights("alex") == (cache / BACKBONE_FILES["alex"][0], other / "v0.1" / "alex.pth")
+    assert install(["alex"], None, None) == [cache / BACKBONE_FILES["alex"]]
+    assert find_weights("alex") == (cache / BACKBONE_FILES["alex"], other / "v0.1" / "alex.pth")
 
 
 def test_without_a_connection_all_that_is_missing_is_named(server, cache):
@@ -152,19 +154,6 @@ def test_what_does_not_arrive_whole_is_not_installed(server, cache, spoil, messa
 # Copying
 
 
-def test_a_copy_under_another_name_gets_that_of_its_checksum(server, cache, tmp_path, monkeypatch):
-    """Features alone must not pass for torchvision's file, wherever they lie."""
-    lay_out(tmp_path, "squeeze")
-    torch.save(random_backbone("squeeze"), tmp_path / SQUEEZE[0])
-    backbone, heads = SOURCES["squeeze"]
-    known = {**backbone.known, sha256(tmp_path / SQUEEZE[0]): "squeeze.backbone.pth"}
-    pair = Published(backbone.url, known), Published(heads.url, {sha256(tmp_path / SQUEEZE[1]): heads.path})
-    monkeypatch.setitem(SOURCES, "squeeze", pair)
-    install(["squeeze"], None, tmp_path)
-    assert files(cache) == ["squeeze.backbone.pth", "v0.1/squeeze.pth"]
-    assert find_weights("squeeze")[0] == cache / "squeeze.backbone.pth"
-
-
 @pytest.mark.parametrize("name", ALEX)
 def test_nothing_is_copied_if_one_file_is_another(server, cache, made, tmp_path, name):
     (tmp_path / "v0.1").mkdir()
@@ -193,7 +182,7 @@ def test_a_folder_that_lacks_files_says_which(server, cache, made, tmp_path):
 
 def test_damaged_weights_are_named_and_not_touched(server, cache, made):
     install(["alex"], None, made)
-    file = cache / BACKBONE_FILES["alex"][0]
+    file = cache / BACKBONE_FILES["alex"]
     before = file.read_bytes()[:1000]
     file.write_bytes(before)
     with pytest.raises(InputError) as caught:
@@ -204,9 +193,9 @@ def test_damaged_weights_are_named_and_not_touched(server, cache, made):
 
 def test_weights_of_one_s_own_are_used_with_a_warning(server, cache, made, caplog):
     install(["squeeze"], None, made)
-    file = cache / BACKBONE_FILES["squeeze"][0]
+    file = cache / BACKBONE_FILES["squeeze"]
     torch.save({key: 2 * value for key, value in random_backbone("squeeze").items()}, file)
-    with caplog.at_level(logging.WARNING, logger=lpips_install.__name__):
+    with caplog.at_level(logging.WARNING, logger=lpips.__name__):
         assert install(["squeeze"], None, None) == []
     assert [f"{file} is not the published file: its SHA-256 is {sha256(file)}"] == caplog.messages
 
@@ -282,17 +271,12 @@ def test_default_nets_are_those_of_the_protocols():
     assert {options["net"] for name, options in metrics if name == "lpips"} == set(DEFAULT_NETS)
 
 
-def first(published):
-    """Checksum of what the URL gives, or its first digits."""
-    return next(iter(published.known))
-
-
 def test_checksums_of_backbones_are_those_in_their_names():
     for net in BACKBONE_FILES:
         backbone, heads = SOURCES[net]
-        assert re.fullmatch(rf"https://download\.pytorch\.org/models/[\w-]+-{first(backbone)}\.pth", backbone.url)
-        assert backbone.path == backbone.url.rpartition("/")[2] == BACKBONE_FILES[net][0]
-        assert re.fullmatch("[0-9a-f]{8}", first(backbone)) and re.fullmatch("[0-9a-f]{64}", first(heads))
+        assert re.fullmatch(rf"https://download\.pytorch\.org/models/[\w-]+-{backbone.sha256}\.pth", backbone.url)
+        assert backbone.path == backbone.url.rpartition("/")[2] == BACKBONE_FILES[net]
+        assert re.fullmatch("[0-9a-f]{8}", backbone.sha256) and re.fullmatch("[0-9a-f]{64}", heads.sha256)
 
 
 # The real files
@@ -300,7 +284,7 @@ def test_checksums_of_backbones_are_those_in_their_names():
 
 def test_the_published_heads_have_the_checksums_of_the_table(shared_data):
     for _, heads in SOURCES.values():
-        assert sha256(shared_data / "lpips" / heads.path) == first(heads)
+        assert sha256(shared_data / "lpips" / heads.path) == heads.sha256
 
 
 # The package
@@ -308,7 +292,7 @@ def test_the_published_heads_have_the_checksums_of_the_table(shared_data):
 
 @pytest.mark.thorough
 def test_nothing_else_in_the_package_reaches_for_the_network():
-    package = Path(lpips_install.__file__).parents[1]
+    package = Path(lpips.__file__).parents[1]
     users = set()
     for path in package.rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text())):
@@ -318,4 +302,4 @@ def test_nothing_else_in_the_package_reaches_for_the_network():
             if roots & {"urllib", "http", "socket", "requests", "pooch", "ftplib"}:
                 users.add(path.relative_to(package).as_posix())
     # The executor only asks whether the cluster that the user named answers, the viewer whether its own port is free.
-    assert users == {"metrics/lpips_install.py", "engine/ray_executor.py", "export/viewer/live.py"}
+    assert users == {"metrics/lpips.py", "engine/ray_executor.py", "export/viewer/live.py"}
