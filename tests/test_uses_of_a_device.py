@@ -8,11 +8,12 @@ import coliags_plugin as cp
 from coliags_plugin.api.training import import_splats
 from coliags_plugin.comparison import compare
 from coliags_plugin.comparison.compare import carry_out
-from coliags_plugin.config.options import SPLAT_FORMATS, CompareOptions
+from coliags_plugin.config.options import CompareOptions
 from coliags_plugin.core.images import read_rgb
 from coliags_plugin.engine import pose_refinement
 from coliags_plugin.engine.camera_path import CameraPath, Keyframe
 from coliags_plugin.export.baking import distillation
+from coliags_plugin.export.splats.formats import WRITERS
 from coliags_plugin.export.viewer.live import Viewer
 from coliags_plugin.geometry.meshes.mesh import read_mesh
 from tests.commands import run as command
@@ -128,7 +129,7 @@ def test_meshes_and_coverage(method, trained, tmp_path):
     [("3dgs", "mean"), ("2dgs", "mean"), ("coliags-in-vivo", "flattened"), ("coliags-in-vivo", "recorded")],
 )
 def test_exports(method, light, trained, wall, tmp_path):
-    formats = tuple(SPLAT_FORMATS)
+    formats = tuple(WRITERS)
     argv = ["export", trained(method), "--light", light, "--seconds", 1, "--no-measure", "--format", *formats]
     with PretendedCuda():
         for device in ("cuda", "cpu"):

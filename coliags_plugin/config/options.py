@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from functools import wraps
 from inspect import getdoc, signature
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, TypeVar, get_origin, get_type_hints
 
 import tyro
 
@@ -61,16 +61,8 @@ Device = Annotated[
 Overwrite = Annotated[bool, tyro.conf.arg(help="Replace the output where it exists.")]
 AsJson = Annotated[bool, tyro.conf.arg(help="Print the summary as JSON.")]
 
-#: Modules of the formats of Gaussians that are written, by name: the suffix of their files.
-SPLAT_FORMATS = {
-    "ply": "coliags_plugin.export.splats.ply",
-    "spz": "coliags_plugin.export.splats.spz",
-    "glb": "coliags_plugin.export.splats.glb",
-}
-if TYPE_CHECKING:
-    SplatFormat = str
-else:
-    SplatFormat = Literal[tuple(SPLAT_FORMATS)]
+#: Format of a file of Gaussians, and its suffix.
+SplatFormat = Literal["ply", "spz", "glb"]
 #: Light of Gaussians for all views.
 Light = Literal["recorded", "mean", "flattened"]
 

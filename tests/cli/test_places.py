@@ -11,7 +11,7 @@ from coliags_plugin import Run, report, train
 from coliags_plugin.comparison.scenes import find_scenes
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.text_files import without_places
-from coliags_plugin.export.splats.cloud import write_splats
+from coliags_plugin.export.splats.formats import write_splats
 from tests.commands import refused, run
 from tests.export.splats.clouds import random_cloud
 from tests.scenes import SMALL, write_wall

@@ -20,7 +20,7 @@ from coliags_plugin.core.json_files import read_json
 from coliags_plugin.core.ply import point_properties, read_triangles, read_vertices, write_ply
 from coliags_plugin.core.text_files import read_text, text_lines, whole_text
 from coliags_plugin.datamanagers.fusion import load_points
-from coliags_plugin.export.splats.cloud import read_splats
+from coliags_plugin.export.splats.formats import read_splats
 from coliags_plugin.geometry.meshes.mesh import read_mesh
 from coliags_plugin.geometry.poses.formats import format_of
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from coliags_plugin.config.options import ExportOptions, TrainOptions
+from coliags_plugin.config.options import ExportOptions, ImportOptions, TrainOptions
 from coliags_plugin.core.images import read_rgb
 from coliags_plugin.core.provenance import Provenance
 from coliags_plugin.core.scenes import PointCloud
@@ -24,7 +24,7 @@ from coliags_plugin.engine.trained import load_trained
 from coliags_plugin.engine.training import open_training
 from coliags_plugin.export.baking import exporting
 from coliags_plugin.export.baking.exporting import export_run, import_run
-from coliags_plugin.export.splats.cloud import read_splats, write_splats
+from coliags_plugin.export.splats.formats import read_splats, write_splats
 from coliags_plugin.reporting.image_files import read_depth_tiff
 from coliags_plugin.surface.meshing.fusion import fuse_run
 from coliags_plugin.surface.meshing.views import MeshSettings
@@ -143,7 +143,7 @@ def test_meshes_and_gaussians_are_in_its_own_world(runs, factor, small, tmp_path
         write_splats(file, clouds[0].scaled(length), "ply")
         for module in (exporting, trained_module):
             monkeypatch.setattr(module, "load_scene", lambda config, _, s=scene: s.with_near_plane(config.near_plane))
-        import_run(file, tmp_path, folder, CPU, "c3vd")
+        import_run(ImportOptions(file, tmp_path, data_format="c3vd"), folder, CPU)
         again = load_trained(folder.path, CPU)
         assert again.model.scale == pytest.approx(factor / length)
         psnr = evaluate(again, "paper").mean("psnr")

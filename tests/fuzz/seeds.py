@@ -12,9 +12,8 @@ import numpy as np
 import open3d
 
 from coliags_plugin.api.training import train
-from coliags_plugin.config.options import SPLAT_FORMATS
 from coliags_plugin.core.intrinsics import Intrinsics
-from coliags_plugin.export.splats.cloud import reader_of, write_splats
+from coliags_plugin.export.splats.formats import READERS, write_splats
 from coliags_plugin.geometry.meshes.mesh import TriangleMesh, read_mesh, write_mesh
 from coliags_plugin.geometry.poses.formats import write_trajectory
 from coliags_plugin.geometry.poses.trajectory import Trajectory
@@ -112,7 +111,7 @@ def _meshes(folder: Path, surface: TriangleMesh) -> None:
 
 def _splats(folder: Path, scene: Path) -> None:
     folder.mkdir()
-    for name in filter(reader_of, SPLAT_FORMATS):
+    for name in READERS:
         write_splats(folder / f"cloud.{name}", random_cloud(20, degree=1), name, "a comment")
     shutil.copytree(scene, folder / "scene", ignore=shutil.ignore_patterns("truth", "rotation"))
 

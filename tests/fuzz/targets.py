@@ -16,12 +16,11 @@ from coliags_plugin.api.scenes import load_scene
 from coliags_plugin.cli import Command
 from coliags_plugin.comparison.named_files import load_ablation, load_benchmark
 from coliags_plugin.config.method_config import load_method
-from coliags_plugin.config.options import SPLAT_FORMATS
 from coliags_plugin.core import bounds
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.files import CHECKSUMS, write_checksums
 from coliags_plugin.core.scenes import Frame
-from coliags_plugin.export.splats.cloud import read_splats, reader_of
+from coliags_plugin.export.splats.formats import READERS, read_splats
 from coliags_plugin.geometry.meshes.mesh import read_mesh
 from coliags_plugin.geometry.meshes.truth import compare_meshes, read_true_surface
 from coliags_plugin.geometry.poses.formats import format_of
@@ -204,10 +203,7 @@ TARGETS: dict[str, Target] = {
         f"mesh-{name}": Target("meshes", (name, "mesh_seen.npz"), _mesh(name))
         for name in ("mesh.ply", "mesh.obj", "mesh.glb", "text.ply")
     },
-    **{
-        f"splats-{name}": Target("splats", (f"cloud.{name}",), _splats(name), True)
-        for name in filter(reader_of, SPLAT_FORMATS)
-    },
+    **{f"splats-{name}": Target("splats", (f"cloud.{name}",), _splats(name), True) for name in READERS},
     "resume": Target("run", _RUN, _resume, True),
     "load-run": Target("run", _RUN, _load_run, True),
     "results": Target("results", ("run/*.*", "run/eval/*/*.*", "run/eval/*/*/*/*"), _results, True),

@@ -51,32 +51,26 @@ class GaussianAverages:
     """
 
     def __init__(self, elements: int, per_element: int, scales: int, device: torch.device) -> None:
-        self._per_element = per_element
-        slots = elements * per_element
-
-        def zeros(*shape: int) -> Tensor:
-            return torch.zeros(shape, device=device)
-
-        self._weights, self._opacities, self._element_weights = zeros(slots), zeros(slots), zeros(elements)
-        self._means, self._log_scales, self._rotations = zeros(slots, 3), zeros(slots, scales), zeros(slots, 4, 4)
-        self._colors, self._log_distances = zeros(slots, 3), zeros(slots, 1)
+        self._per_element, slots = per_element, elements * per_element
+        self._sizes = [3, 3, 1, scales, 16]  # of mean, colour, log distance, log scales, and product of quaternions
+        self._sums = torch.zeros(slots, sum(self._sizes), device=device)
+        self._weights, self._opacities = torch.zeros(2, slots, device=device)
+        self._element_weights = torch.zeros(elements, device=device)
 
     def add(self, gaussians: Gaussians, weights: Float[Tensor, "N"], camera: Camera) -> None:
         """Add a view's Gaussians by their :func:`blending_weights`, or other weights."""
         slots = gaussians.source_index
         elements = slots // self._per_element
         shown = torch.zeros_like(self._element_weights).index_add_(0, elements, weights)
-        quats = torch.nn.functional.normalize(gaussians.quats_wxyz, dim=1)
-        products = quats[:, :, None] * quats[:, None]
         self._element_weights += shown
         self._opacities.index_add_(0, slots, shown[elements] * gaussians.opacities)
         self._weights.index_add_(0, slots, weights)
-        self._means.index_add_(0, slots, weights[:, None] * gaussians.means)
-        self._colors.index_add_(0, slots, weights[:, None] * gaussians.colors)
         distances = (gaussians.means - camera.center.to(gaussians.means)).norm(dim=1, keepdim=True)
-        self._log_distances.index_add_(0, slots, weights[:, None] * distances.clamp_min(_NONE).log())
-        self._log_scales.index_add_(0, slots, weights[:, None] * gaussians.scales.log())
-        self._rotations.index_add_(0, slots, weights[:, None, None] * products)
+        quats = torch.nn.functional.normalize(gaussians.quats_wxyz, dim=1)
+        products = (quats[:, :, None] * quats[:, None]).flatten(1)
+        logs = distances.clamp_min(_NONE).log(), gaussians.scales.log()
+        values = torch.cat([gaussians.means, gaussians.colors, *logs, products], dim=1)
+        self._sums.index_add_(0, slots, weights[:, None] * values)
 
     def visible(self) -> Int[Tensor, "N"]:
         """Slots of the Gaussians that are visible in a view, ascending; InputError where none is. [N]"""
@@ -94,7 +88,7 @@ class GaussianAverages:
 
     def mean_colors(self, slots: Int[Tensor, "N"]) -> Float[Tensor, "N 3"]:
         """Mean colours (RGB) of some slots. [N, 3]"""
-        return self._colors[slots] / self._weights[slots][:, None]
+        return self._sums[slots, 3:6] / self._weights[slots][:, None]
 
     def _mean_opacities(self) -> Float[Tensor, "L"]:
         shown = self._element_weights.repeat_interleave(self._per_element)
@@ -103,15 +97,16 @@ class GaussianAverages:
     def cloud(self, slots: Int[Tensor, "N"], harmonics: Float[Tensor, "N B 3"], attenuated: bool = False) -> SplatCloud:
         """The averages of some slots with given colours, which may fall with the distance to the lamp."""
         weights = self._weights[slots][:, None]
+        means, _, log_distances, log_scales, products = torch.split(self._sums[slots], self._sizes, dim=1)
         parts = [
-            self._means[slots] / weights,
-            torch.linalg.eigh(self._rotations[slots]).eigenvectors[:, :, -1],
-            (self._log_scales[slots] / weights).exp(),
+            means / weights,
+            torch.linalg.eigh(products.view(-1, 4, 4)).eigenvectors[:, :, -1],
+            (log_scales / weights).exp(),
             self._mean_opacities()[slots].clamp(1e-4, 1.0 - 1e-4),
             harmonics,
         ]
         if attenuated:
-            distances = (self._log_distances[slots] / weights).exp()
+            distances = (log_distances / weights).exp()
             parts.append(torch.cat([distances, torch.full_like(distances, INVERSE_SQUARE)], dim=1))
         return SplatCloud.of_tensors(*parts).with_thickness()
 

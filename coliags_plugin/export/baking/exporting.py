@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 
-from coliags_plugin.config.options import SPLAT_FORMATS, ExportOptions
+from coliags_plugin.config.options import ExportOptions, ImportOptions
 from coliags_plugin.contracts import Comparison, GaussianField
 from coliags_plugin.core.errors import InputError, check_name
 from coliags_plugin.core.files import atomic_folder, file_sha256, refuse_existing, write_json
@@ -27,14 +27,8 @@ from coliags_plugin.engine.trained import TrainedRun
 from coliags_plugin.engine.trainer import Trainer
 from coliags_plugin.export.baking.baking import bake
 from coliags_plugin.export.baking.distillation import adjusted_camera, model_of_gaussians
-from coliags_plugin.export.splats.cloud import (
-    SplatCloud,
-    field_of_cloud,
-    load_cloud,
-    read_splats,
-    reader_of,
-    write_splats,
-)
+from coliags_plugin.export.splats.cloud import SplatCloud, field_of_cloud, load_cloud
+from coliags_plugin.export.splats.formats import READERS, WRITERS, read_splats, write_splats
 from coliags_plugin.reporting.numbers import counted
 
 log = logging.getLogger(__name__)
@@ -45,8 +39,8 @@ RECORD_VERSION = 1
 _METRICS = ("psnr", "depth_mse")
 #: Methods of imported Gaussians, by the number of their scales.
 _METHODS = {3: "3dgs", 2: "2dgs"}
-#: Training cameras, approximately, that are asked what they see of a file; and the share of it that is too few.
-_CAMERAS, _FEW = 16, 0.01
+#: Views, approximately, of which an imported file must show something.
+_VIEWS = 16
 
 
 @dataclass(frozen=True)
@@ -73,22 +67,46 @@ def export_run(trained: TrainedRun, options: ExportOptions) -> list[Exported]:
     it has no effect where colours know no lamp. With ``measure``, each file is compared with the run on the held-out
     views.
     """
-    formats, light = options.formats, options.light
+    scene, formats = trained.scene, options.formats
     file = options.output or trained.run.path / "export" / f"{trained.provenance['scene']['name']}.{formats[0]}"
     outputs = {form: file.with_suffix(f".{form}") if len(formats) > 1 else file for form in formats}
     for form, output in outputs.items():
-        check_name("format", form, SPLAT_FORMATS)
+        check_name("format", form, WRITERS)
         for target in (output, _record_file(output)):
             refuse_existing(target, options.overwrite, "a new file")
     field = _gaussian_field(trained)
-    held_lamp = held_light(light, trained.model, [frame.camera for frame in trained.scene.train])
-    cloud, facts = bake(trained, held_lamp, options.seconds)
-    baking = {"light": light_facts(light, field, held_lamp), **facts} if facts else None
+    light = held_light(options.light, trained.model, [frame.camera for frame in scene.train])
+    cloud, facts = bake(trained, light, options.seconds)
     cloud = cloud.with_thickness().checked(trained.run.path)
-    cost_light = held_lamp if field.knows_lamp else None
-    return [
-        _written(trained, cloud, form, output, baking, cost_light, options.measure) for form, output in outputs.items()
-    ]
+    comment = f"{trained.method} on {scene.name}, exported by coliags_plugin; lengths in {scene.length_unit}"
+    exported = []
+    for form, output in outputs.items():
+        write_splats(output, cloud, form, comment)
+        stored = READERS[form](output) if form in READERS else cloud
+        size, sha256 = output.stat().st_size, file_sha256(output)
+        record = {
+            "format": "coliags-export",
+            "version": RECORD_VERSION,
+            "file": {"name": output.name, "format": form, "bytes": size, "sha256": sha256},
+            "gaussians": len(cloud),
+            "sh_degree": cloud.degree,
+            "bounds": {"min": cloud.means.min(axis=0).tolist(), "max": cloud.means.max(axis=0).tolist()},
+            "unit": scene.length_unit,
+            "frame": "world of the scene",
+            "run": {
+                "method": trained.method,
+                "scene": scene.name,
+                "fingerprint": scene.provenance.fingerprint,
+                "seed": trained.seed,
+                "step": trained.step,
+            },
+            "baking": {"light": light_facts(options.light, field, light), **facts} if facts else None,
+            "cost": export_cost(trained, stored, light if field.knows_lamp else None) if options.measure else None,
+            "software": software(),
+        }
+        write_json(_record_file(output), record)
+        exported.append(Exported(output, _record_file(output), record))
+    return exported
 
 
 def light_facts(name: str, field: GaussianField, light: HeldLight | None) -> dict[str, Any] | None:
@@ -98,49 +116,6 @@ def light_facts(name: str, field: GaussianField, light: HeldLight | None) -> dic
 
 def _record_file(output: Path) -> Path:
     return output.with_name(f"{output.name}.json")
-
-
-def _written(
-    trained: TrainedRun,
-    cloud: SplatCloud,
-    form: str,
-    output: Path,
-    baking: Mapping[str, Any] | None,
-    light: HeldLight | None,
-    measure: bool,
-) -> Exported:
-    unit = trained.scene.length_unit
-    comment = f"{trained.method} on {trained.scene.name}, exported by coliags_plugin; lengths in {unit}"
-    write_splats(output, cloud, form, comment)
-    read = reader_of(form)
-    stored = cloud if read is None else read(output)
-    record = {
-        "format": "coliags-export",
-        "version": RECORD_VERSION,
-        "file": {
-            "name": output.name,
-            "format": form,
-            "bytes": output.stat().st_size,
-            "sha256": file_sha256(output),
-        },
-        "gaussians": len(cloud),
-        "sh_degree": cloud.degree,
-        "bounds": {"min": cloud.means.min(axis=0).tolist(), "max": cloud.means.max(axis=0).tolist()},
-        "unit": unit,
-        "frame": "world of the scene",
-        "run": {
-            "method": trained.method,
-            "scene": trained.scene.name,
-            "fingerprint": trained.scene.provenance.fingerprint,
-            "seed": trained.seed,
-            "step": trained.step,
-        },
-        "baking": baking,
-        "cost": export_cost(trained, stored, light) if measure else None,
-        "software": software(),
-    }
-    write_json(_record_file(output), record)
-    return Exported(output, _record_file(output), record)
 
 
 def _gaussian_field(trained: TrainedRun) -> GaussianField:
@@ -238,22 +213,15 @@ def _means(rows: list[dict[str, float]]) -> dict[str, float]:
     return {name: sum(numbers) / len(numbers) for name, numbers in values.items() if numbers}
 
 
-def import_run(
-    file: Path,
-    data: Path,
-    output: RunFolder,
-    device: torch.device,
-    data_format: str | None = None,
-    overwrite: bool = False,
-) -> None:
+def import_run(options: ImportOptions, output: RunFolder, device: torch.device) -> None:
     """Make a run of a file of Gaussians: a run folder at step 0, to evaluate, render and report like any other.
 
-    The file is in the frame and unit of the scene in the folder ``data``, which the named data manager reads, or the
-    one that recognises it; ``device`` is recorded.
+    The file is in the frame and unit of the scene; ``device`` is recorded.
     """
-    output.check_free(overwrite)
+    file, data = options.file, options.data
+    output.check_free(options.overwrite)
     cloud = read_splats(file)
-    method = load_method_for(data, _METHODS[cloud.scales.shape[1]], data_format=data_format)
+    method = load_method_for(data, _METHODS[cloud.scales.shape[1]], data_format=options.data_format)
     config = method.config
     scene = load_scene(config, data)
     # As in training: the near plane and other constants are lengths in mm.
@@ -262,7 +230,7 @@ def import_run(
     field = config.field.target(config.field.settings, len(cloud))
     load_cloud(field, cloud)
     trainer = Trainer(method, scene, str(data.resolve()), output, 0, device, field)
-    _warn_of_another_frame(trainer, cloud, file)
+    _warn_of_another_frame(trainer, file)
     provenance = trainer.provenance()
     del provenance["plan"]
     provenance["imported"] = {"file": file.name, "gaussians": len(cloud), "sh_degree": cloud.degree}
@@ -273,24 +241,16 @@ def import_run(
 
 
 @torch.no_grad()
-def _warn_of_another_frame(trainer: Trainer, cloud: SplatCloud, file: Path) -> None:
-    """Say so where the training cameras have hardly any Gaussian in their images, or some views show nothing."""
-    scene, model = trainer.scene, trainer.model
-    means = torch.from_numpy(cloud.means).double()
-    in_view = torch.zeros(len(means), dtype=torch.bool)
-    for frame in scene.train[:: max(1, len(scene.train) // _CAMERAS)]:
-        in_view |= frame.camera.to(dtype=torch.float64).sees(means)[1]
-    share = float(in_view.float().mean())
-    if share < _FEW:
-        finding = f"{100.0 * share:.2g} % of the Gaussians lie in the view of a training camera"
-    else:
-        views = [frame for frames in scene.test_sets.values() for frame in frames] or scene.train
-        placed = [frame.to(trainer.device) for frame in views[:: max(1, len(views) // _CAMERAS)]]
-        blank = sum(
-            shows_nothing(model.render(each.camera, view=each.view(trained=False)).alpha, each) for each in placed
+def _warn_of_another_frame(trainer: Trainer, file: Path) -> None:
+    """Warn where views show nothing of the Gaussians."""
+    scene = trainer.scene
+    views = [frame for frames in scene.test_sets.values() for frame in frames] or scene.train
+    placed = [frame.to(trainer.device) for frame in views[:: max(1, len(views) // _VIEWS)]]
+    shown = (trainer.model.render(frame.camera, view=frame.view(trained=False)).alpha for frame in placed)
+    blank = sum(map(shows_nothing, shown, placed))
+    if blank:
+        log.warning(
+            "%s: %d of %d views of it show nothing, nothing nearer than near_plane is drawn; "
+            "is it in the world frame and unit (%s) of scene '%s'?",
+            *(file, blank, len(placed), scene.length_unit, scene.name),
         )
-        if not blank:
-            return
-        finding = f"{blank} of {len(placed)} views of it show nothing, nothing nearer than near_plane is drawn"
-    question = "is it in the world frame and unit (%s) of scene '%s'?"
-    log.warning(f"%s: %s; {question}", file, finding, scene.length_unit, scene.name)

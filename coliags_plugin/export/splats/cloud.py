@@ -1,17 +1,10 @@
-"""Gaussians of an explicit field or a file: a world frame, plain numbers, colours as spherical harmonics.
-
-A format of files is a module of :data:`~coliags_plugin.config.options.SPLAT_FORMATS` with ``write(path, cloud,
-comment)`` and, if its files are read as well, ``read(path)``.
-"""
+"""Gaussians of an explicit field or a file: a world frame, plain numbers, colours as spherical harmonics."""
 
 from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from importlib import import_module
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -19,9 +12,8 @@ from jaxtyping import Bool, Float32
 from scipy.special import logit
 from torch import Tensor
 
-from coliags_plugin.config.options import SPLAT_FORMATS
 from coliags_plugin.core import bounds
-from coliags_plugin.core.errors import InputError, check_name
+from coliags_plugin.core.errors import InputError
 from coliags_plugin.fields.explicit_gaussians import AttenuatedGaussians, ExplicitGaussians, ExplicitGaussiansSettings
 from coliags_plugin.fields.spherical_harmonics import Y0
 
@@ -99,18 +91,16 @@ class SplatCloud:
         """The arrays that it has, by the names of their fields."""
         return {name: values for name, values in vars(self).items() if values is not None}
 
-    @property
-    def usable(self) -> Bool[np.ndarray, "N"]:
-        """Mask of Gaussians that are finite, have a rotation, and lie and extend within the bounds of lengths. [N]"""
+    def checked(self, source: object) -> SplatCloud:
+        """The Gaussians that can be used, of which there must be one; of others there is a warning with their number.
+
+        They are finite, have a rotation, and lie and extend within the bounds of lengths; ``source`` is for messages.
+        """
         parts = [np.isfinite(part).all(axis=tuple(range(1, part.ndim))) for part in self._arrays().values()]
         with np.errstate(over="ignore", invalid="ignore"):
             parts.append(np.square(self.quats_wxyz.astype(np.float64)).sum(axis=1) > 1e-24)
             parts += [(np.abs(lengths) <= bounds.LENGTH).all(axis=1) for lengths in (self.means, self.scales)]
-        return np.all(parts, axis=0)
-
-    def checked(self, source: object) -> SplatCloud:
-        """The usable Gaussians, of which there must be one; the number of others is a warning that names the source."""
-        usable = self.usable
+        usable = np.all(parts, axis=0)
         count = int(usable.sum())
         if not count:
             raise InputError(
@@ -164,26 +154,3 @@ def field_of_cloud(cloud: SplatCloud) -> ExplicitGaussians:
                 values.copy_(torch.from_numpy(cloud.attenuation[:, column : column + 1]))
     load_cloud(field, cloud)
     return field
-
-
-def write_splats(path: Path, cloud: SplatCloud, name: str, comment: str = "") -> None:
-    """Write at least one Gaussian, all finite, in a named format; surfels become flat Gaussians."""
-    check_name("format", name, SPLAT_FORMATS)
-    if not len(cloud):
-        raise InputError("no Gaussian to write", "at least one")
-    import_module(SPLAT_FORMATS[name]).write(path, cloud.with_thickness(), comment)
-
-
-def reader_of(name: str) -> Callable[[Path], SplatCloud] | None:
-    """The function that reads files of a format; None where they are only written."""
-    return getattr(import_module(SPLAT_FORMATS[name]), "read", None)
-
-
-def read_splats(path: Path) -> SplatCloud:
-    """Read Gaussians, in the format of the suffix; rows that are not finite are dropped with a warning."""
-    name = path.suffix.lower().removeprefix(".")
-    read = reader_of(name) if name in SPLAT_FORMATS else None
-    if read is None:
-        formats = ", ".join(f".{name}" for name in SPLAT_FORMATS if reader_of(name))
-        raise InputError(f"{path}: no reader for '{path.suffix}'", f"a file {formats}")
-    return read(path).checked(path)

@@ -215,17 +215,14 @@ class Viewer(Follower):
         self.wake()
         if self._thread.is_alive():
             self._thread.join()
-        self._stop_server()
+        with contextlib.redirect_stdout(io.StringIO()):  # it prints that it stops
+            self._server.stop()
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *error: object) -> None:
         self.close()
-
-    def _stop_server(self) -> None:
-        with contextlib.redirect_stdout(io.StringIO()):  # it prints that it stops
-            self._server.stop()
 
     def _set_start(self) -> None:
         """Let browsers start at the first training camera, upright, before black, with a plain panel and one light."""

@@ -7,9 +7,8 @@ import math
 import tempfile
 import zlib
 from base64 import b64encode
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -31,8 +30,8 @@ from coliags_plugin.engine.trained import TrainedRun
 from coliags_plugin.export.baking.baking import bake
 from coliags_plugin.export.baking.distillation import adjusted_camera, best_frame
 from coliags_plugin.export.baking.exporting import cost_lines, export_cost, light_facts
-from coliags_plugin.export.splats import spz
 from coliags_plugin.export.splats.cloud import SplatCloud, field_of_cloud
+from coliags_plugin.export.splats.formats import read_spz, write_spz
 from coliags_plugin.fields.explicit_gaussians import FARTHEST
 from coliags_plugin.geometry.meshes.mesh import TriangleMesh, read_mesh
 from coliags_plugin.renderers.splatting import SplattingRenderer
@@ -49,12 +48,10 @@ _RATE = 10.0
 _REACH = 1024.0
 #: Share of the Gaussians, at either end, whose distance to the lamp, or exponent, is brought to those of the others.
 _RARE = 0.001
-#: Bytes of a page that a Gaussian takes, about: 22, compressed and in base 64.
-_BYTES = 24
+#: Bytes of a page that a Gaussian takes, at most: 22 in base 64, if it cannot be compressed.
+_BYTES = 30
 #: Room for the line about the Gaussians.
 _LINE_BYTES = 2000
-#: How much of the room found in one attempt the next one uses.
-_CAUTION = 0.98
 #: How much of a mesh's brightness follows from a light at the camera: colours of the video have their shading already.
 _SHADE_OF_SURFACE, _SHADE_OF_MAP = 0.5, 0.7
 _ASSETS = Path(__file__).with_name("assets")
@@ -70,7 +67,7 @@ class Layer:
     legend: Sequence[tuple[str, tuple[int, int, int]]] = ()  # what its colours (RGB) mean
 
     @classmethod
-    def of_cloud(cls, name: str, cloud: SplatCloud) -> tuple[Self, SplatCloud]:
+    def of_cloud(cls, cloud: SplatCloud) -> tuple[Self, SplatCloud]:
         """Gaussians as an SPZ file, without a text, and the cloud that a reader gets back, rounded as SPZ rounds.
 
         Positions and scales are multiples of a unit, a power of two in which the cloud has about SPZ's range.
@@ -79,13 +76,13 @@ class Layer:
         unit = 2.0 ** math.ceil(math.log2(reach / _REACH)) if reach > 0.0 else 1.0
         with tempfile.TemporaryDirectory() as folder:
             file = Path(folder) / "cloud.spz"
-            spz.write(file, cloud.scaled(1.0 / unit))
-            data, drawn = file.read_bytes(), spz.read(file).scaled(unit)
+            write_spz(file, cloud.scaled(1.0 / unit))
+            data, drawn = file.read_bytes(), read_spz(file).scaled(unit)
         packed = {"kind": "gaussians", "unit": unit, "data": b64encode(data).decode("ascii")}
         if cloud.attenuation is not None:
             packed["attenuation"], attenuation = _packed_attenuation(cloud.attenuation)
             drawn = replace(drawn, attenuation=attenuation)
-        return cls(name, "", packed), drawn
+        return cls("Gaussians", "", packed), drawn
 
     @classmethod
     def of_mesh(cls, name: str, about: str, mesh: TriangleMesh, shade: float) -> Self:
@@ -109,49 +106,46 @@ class Layer:
         return cls(name, about, packed)
 
 
-@dataclass(frozen=True)
-class CameraPath:
-    """Poses and pictures of a video's frames, which a page follows."""
+def packed_path(frames: Sequence[Frame], cameras: Sequence[Camera], training: Collection[str]) -> dict[str, Any]:
+    """JSON values of a video that a page follows: intrinsics, and frames with pictures of at most 240, evenly spaced.
 
-    frames: Sequence[Frame]  # in their order
-    cameras: Sequence[Camera]  # of each; they share intrinsics
-    training: frozenset[str]  # names of the frames that were trained on
-
-    @cached_property
-    def packed(self) -> list[dict[str, Any]]:
-        """JSON values of every frame; pictures of at most 240, evenly spaced."""
-        every = -(-len(self.frames) // _PICTURES)
-        return [
-            {
-                "name": frame.name,
-                "axes": camera.camera_to_world[:3, :3].tolist(),
-                "center": camera.camera_to_world[:3, 3].tolist(),
-                "held_out": frame.name not in self.training,
-                "picture": EncodedImage.jpeg(frame.image, _QUALITY, _WIDTH).uri if index % every == 0 else None,
-            }
-            for index, (frame, camera) in enumerate(zip(self.frames, self.cameras, strict=True))
-        ]
+    Args:
+        frames: The frames in their order.
+        cameras: Camera of each; they share intrinsics.
+        training: Names of the frames that were trained on.
+    """
+    every = -(-len(frames) // _PICTURES)
+    packed = [
+        {
+            "name": frame.name,
+            "axes": camera.camera_to_world[:3, :3].tolist(),
+            "center": camera.camera_to_world[:3, 3].tolist(),
+            "held_out": frame.name not in training,
+            "picture": EncodedImage.jpeg(frame.image, _QUALITY, _WIDTH).uri if index % every == 0 else None,
+        }
+        for index, (frame, camera) in enumerate(zip(frames, cameras, strict=True))
+    ]
+    intrinsics = {name: getattr(cameras[0], name) for name in ("fx", "fy", "cx", "cy", "width", "height")}
+    return {"camera": intrinsics, "frames": packed}
 
 
 def page_html(
-    title: str, layers: Sequence[Layer], path: CameraPath, start: int, distance: float, blur: float, near: float
+    title: str, layers: Sequence[Layer], path: Mapping[str, Any], start: int, distance: float, blur: float, near: float
 ) -> str:
     """One self-contained HTML file: layers, camera path and pictures of frames are embedded.
 
     Args:
         title: Of the page.
         layers: What can be shown; the first is seen at first.
-        path: Where the camera goes.
+        path: Where the camera goes, as of :func:`packed_path`.
         start: Index of the frame that the page opens at.
         distance: Distance of the wall from the cameras, scene units: how far a step goes.
         blur: Variance that the renderer adds to Gaussians in the image, square pixels.
         near: z-depth from which on something is drawn, scene units.
     """
-    camera = path.cameras[0]
     scene = {
         "layers": [{"about": layer.about, "legend": layer.legend, **layer.packed} for layer in layers],
-        "camera": {name: getattr(camera, name) for name in ("fx", "fy", "cx", "cy", "width", "height")},
-        "frames": path.packed,
+        **path,
         "start": start,
         "distance": distance,
         "range": [near, 1e4 * distance],
@@ -160,7 +154,7 @@ def page_html(
     }
     text = Markup(json.dumps(scene, separators=(",", ":")).replace("</", "<\\/"))
     style, script = (Markup((_ASSETS / f"scene.{kind}").read_text(encoding="utf-8")) for kind in ("css", "js"))
-    values = {"title": title, "layers": layers, "frames": len(path.frames), "scene": text}
+    values = {"title": title, "layers": layers, "frames": len(path["frames"]), "scene": text}
     return environment(_ASSETS).get_template("scene.html").render(**values, style=style, script=script)
 
 
@@ -208,10 +202,9 @@ def scene_page(trained: TrainedRun, options: PageOptions | None = None, most_ste
     meshes.
     """
     options = options or PageOptions()
-    largest = options.largest
     meshes = [_mesh_layer(name, read_mesh(file)) for name, file in mesh_files(trained.run.path).items()]
-    frames = trained.scene.video
-    path = CameraPath(frames, [adjusted_camera(trained, frame) for frame in frames], trained.training_frames)
+    video = trained.scene.video
+    path = packed_path(video, [adjusted_camera(trained, frame) for frame in video], trained.training_frames)
     if isinstance(trained.model.field, GaussianField):
         return _page_of_gaussians(trained, trained.model.field, path, meshes, options, most_steps)
     if not meshes:
@@ -221,8 +214,9 @@ def scene_page(trained: TrainedRun, options: PageOptions | None = None, most_ste
             "Run `coliags mesh` first, or write pictures with `coliags render`",
         )
     html = _html(trained, path, meshes)
-    if len(html.encode()) > largest:
-        raise InputError(f"a page of {largest} bytes", f"at least {len(html.encode())} bytes, what its meshes take")
+    size, largest = len(html.encode()), options.largest
+    if size > largest:
+        raise InputError(f"a page of {largest} bytes", f"at least {size} bytes, what its meshes take")
     text = f"{trained.method} on {trained.scene.name}, step {trained.step}; no Gaussians"
     return ScenePage(html, text, {"gaussians": 0})
 
@@ -239,7 +233,7 @@ def _mesh_layer(name: str, mesh: TriangleMesh) -> Layer:
 def _page_of_gaussians(
     trained: TrainedRun,
     field: GaussianField,
-    path: CameraPath,
+    path: Mapping[str, Any],
     meshes: list[Layer],
     options: PageOptions,
     most_steps: int | None,
@@ -252,10 +246,7 @@ def _page_of_gaussians(
     attenuated = lamp is None and field.knows_lamp
     splats, baking = bake(trained, lamp, options.seconds, (largest - empty) // _BYTES, 0, attenuated, most_steps)
     first = best_frame(field_of_cloud(splats), trained, lamp)
-    layer, drawn = Layer.of_cloud("Gaussians", splats)
-    while empty + (size := len(json.dumps(layer.packed))) > largest:
-        splats = most_visible(splats, int(_CAUTION * len(splats) * (largest - empty) / size))
-        layer, drawn = Layer.of_cloud("Gaussians", splats)
+    layer, drawn = Layer.of_cloud(splats)
     cost = export_cost(trained, drawn, lamp if field.knows_lamp else None)
     parts = [f"step {trained.step}", f"{len(splats):,} of {baking['visible']:,} Gaussians"]
     if field.knows_lamp:
@@ -267,7 +258,7 @@ def _page_of_gaussians(
 
 
 def _html(
-    trained: TrainedRun, path: CameraPath, layers: list[Layer], splats: SplatCloud | None = None, first: int = 0
+    trained: TrainedRun, path: Mapping[str, Any], layers: list[Layer], splats: SplatCloud | None = None, first: int = 0
 ) -> str:
     """The page of a run for any layers; ``splats`` tell how far the wall is, and it opens at a training frame."""
     scene, renderer = trained.scene, trained.model.renderer
@@ -282,14 +273,6 @@ def look_distance(scene: Scene, camera: Camera, points: Float[Tensor, "N 3"]) ->
     """Median depth, in a view, of points in the world; of none, the extent of the scene."""
     depth, in_view = camera.to("cpu", torch.float64).sees(points.detach().cpu().double())
     return float(depth[in_view].median()) if in_view.any() else scene.extent or 1.0
-
-
-def most_visible(splats: SplatCloud, count: int) -> SplatCloud:
-    """At most so many splats: those that cover most, by opacity times area seen from the front, in their order."""
-    covers = splats.opacities * np.sort(splats.scales, axis=1)[:, 1:].prod(axis=1)
-    chosen = np.zeros(len(splats), bool)
-    chosen[np.argsort(-covers, kind="stable")[:count]] = True
-    return splats.part(chosen)
 
 
 def mesh_files(run: Path) -> dict[str, Path]:

@@ -24,7 +24,8 @@ from coliags_plugin.export.baking import distillation
 from coliags_plugin.export.baking.baking import GaussianAverages, SeenColors, bake, blending_weights, fit_harmonics
 from coliags_plugin.export.baking.distillation import beside
 from coliags_plugin.export.baking.exporting import export_cost
-from coliags_plugin.export.splats.cloud import SplatCloud, cloud_of_field, field_of_cloud, read_splats, write_splats
+from coliags_plugin.export.splats.cloud import SplatCloud, cloud_of_field, field_of_cloud
+from coliags_plugin.export.splats.formats import read_splats, write_splats
 from coliags_plugin.fields.spherical_harmonics import basis, colors
 from coliags_plugin.renderers.torch_renderer import TorchRenderer, TorchRendererSettings
 from tests.commands import refused, run
@@ -380,16 +381,16 @@ def test_imports_that_cannot_be(wall, tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
-    ("change", "text"),
+    "change",
     [
-        (lambda cloud: {"means": cloud.means - np.float32(5000)}, "0 % of the Gaussians lie in the view of a"),
-        (lambda cloud: {"means": cloud.means / 1000, "scales": cloud.scales / 1000}, "(of the Gaussians|show nothing)"),
-        (lambda cloud: {"opacities": np.full_like(cloud.opacities, 1e-6)}, "2 of 2 views of it show nothing"),
+        lambda cloud: {"means": cloud.means - np.float32(5000)},
+        lambda cloud: {"means": cloud.means / 1000, "scales": cloud.scales / 1000},
+        lambda cloud: {"opacities": np.full_like(cloud.opacities, 1e-6)},
     ],
 )
-def test_a_file_of_another_world_is_imported_with_a_warning(wall, tmp_path, caplog, change, text):
+def test_a_file_of_another_world_is_imported_with_a_warning(wall, tmp_path, caplog, change):
     cloud = random_cloud(200)
     write_splats(tmp_path / "far.ply", replace(cloud, **change(cloud)), "ply")
     with caplog.at_level(logging.WARNING):
         cp.import_splats(tmp_path / "far.ply", wall, tmp_path / "run")
-    assert re.search(f"{text}.*world frame and unit", caplog.text)
+    assert re.search("2 of 2 views of it show nothing.*world frame and unit", caplog.text)

@@ -23,8 +23,9 @@ from coliags_plugin.core.gaussians import rotation_of_vector
 from coliags_plugin.core.images import read_rgb
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.export.baking import distillation
-from coliags_plugin.export.splats.cloud import field_of_cloud, read_splats
-from coliags_plugin.export.viewer.page import CameraPath, Layer, most_visible, page_html, scene_page
+from coliags_plugin.export.splats.cloud import field_of_cloud
+from coliags_plugin.export.splats.formats import read_splats
+from coliags_plugin.export.viewer.page import Layer, packed_path, page_html, scene_page
 from coliags_plugin.fields.spherical_harmonics import Y0
 from coliags_plugin.geometry.meshes.mesh import TriangleMesh, write_mesh
 from coliags_plugin.renderers.torch_renderer import TorchRenderer, TorchRendererSettings
@@ -68,12 +69,12 @@ def attenuated(cloud):
 
 
 def page_of(*layers):
-    path = CameraPath(FRAMES, [frame.camera for frame in FRAMES], frozenset({"f0", "f2"}))
+    path = packed_path(FRAMES, [frame.camera for frame in FRAMES], {"f0", "f2"})
     return page_html("a <scene>", layers, path, 1, 20.0, 0.3, 0.2)
 
 
 def gaussians(cloud, about=""):
-    layer, _ = Layer.of_cloud("Gaussians", cloud)
+    layer, _ = Layer.of_cloud(cloud)
     return replace(layer, about=about)
 
 
@@ -104,7 +105,7 @@ def test_gaussians_are_an_spz_in_a_unit_of_their_own(tmp_path, size):
     (layer,) = data_of(page_of(gaussians(cloud)))["layers"]
     (tmp_path / "a.spz").write_bytes(b64decode(layer["data"]))
     read = read_splats(tmp_path / "a.spz")
-    _, drawn = Layer.of_cloud("Gaussians", cloud)
+    _, drawn = Layer.of_cloud(cloud)
     np.testing.assert_allclose(drawn.means, read.means * layer["unit"], rtol=1e-6)
     np.testing.assert_allclose(drawn.scales, read.scales * layer["unit"], rtol=1e-6)
     np.testing.assert_allclose(read.means * layer["unit"], cloud.means, atol=2e-5 * 10 * size)
@@ -114,7 +115,7 @@ def test_gaussians_are_an_spz_in_a_unit_of_their_own(tmp_path, size):
 def test_attenuation_is_bytes_between_bounds_that_rare_values_do_not_move():
     cloud = attenuated(cloud_of(2000, 0))
     cloud.attenuation[7] = 20.0, 900.0
-    layer, drawn = Layer.of_cloud("Gaussians", cloud)
+    layer, drawn = Layer.of_cloud(cloud)
     packed = layer.packed["attenuation"]
     levels = np.frombuffer(zlib.decompress(b64decode(packed["data"])), np.uint8).reshape(2, -1)
     read = np.array(packed["low"])[:, None] + np.array(packed["span"])[:, None] * levels / 255.0
@@ -124,7 +125,7 @@ def test_attenuation_is_bytes_between_bounds_that_rare_values_do_not_move():
     np.testing.assert_allclose(drawn.attenuation[usual, 0], cloud.attenuation[usual, 0], rtol=0.01)
     np.testing.assert_allclose(drawn.attenuation[usual, 1], cloud.attenuation[usual, 1], atol=0.02)
     assert drawn.attenuation[7, 1] == pytest.approx(1.0, abs=0.02)
-    assert "attenuation" not in Layer.of_cloud("Gaussians", cloud_of(10, 0))[0].packed
+    assert "attenuation" not in Layer.of_cloud(cloud_of(10, 0))[0].packed
 
 
 def test_a_mesh_is_quantised_in_its_box():
@@ -245,7 +246,7 @@ def test_a_small_page_has_the_most_visible_gaussians(anchors):
     with pytest.raises(InputError) as error:
         scene_page(trained, PageOptions(size="1000"))
     empty = int(re.search(r"more than (\d+) bytes", str(error.value))[1])
-    largest = empty + 10 * whole.facts["gaussians"]  # room for about half of them
+    largest = empty + 15 * whole.facts["gaussians"]  # room for about half of them
     small = scene_page(trained, PageOptions(size=str(largest)))
     assert len(small.html.encode()) <= largest
     assert 0.4 < small.facts["gaussians"] / whole.facts["gaussians"] < 0.6
@@ -293,12 +294,3 @@ def test_meshes_of_the_run_are_layers_and_maps_of_coverage_have_a_legend_of_thei
     assert '"about":"1 triangle","legend":[]' in page.html
     assert '"legend":[["seen",[150,200,190]],["not seen",[213,62,0]]]' in page.html
     assert "Gaussians; " in page.text and "recorded light" not in page.text, "the method knows no lamp"
-
-
-def test_the_most_visible_are_the_opaque_and_large_ones():
-    splats = random_cloud(4, 0)
-    splats.scales[:] = [[1.0, 2.0, 0.1], [1.0, 1.0, 0.9], [3.0, 0.1, 2.0], [1.0, 1.0, 1.0]]
-    splats.opacities[:] = [0.5, 0.9, 0.1, 0.8]  # they cover 1, 0.9, 0.6 and 0.8
-    np.testing.assert_array_equal(most_visible(splats, 2).means, splats.means[:2])
-    np.testing.assert_array_equal(most_visible(splats, 3).means, splats.means[[0, 1, 3]])
-    assert len(most_visible(splats, 9)) == 4
