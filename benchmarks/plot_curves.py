@@ -15,9 +15,8 @@ from typing import Any
 import tyro
 
 from coliags_plugin.core.files import atomic_write
-from coliags_plugin.reporting.charts import Series
 from coliags_plugin.reporting.html_page import html_blocks
-from coliags_plugin.reporting.model import Chart, Figures
+from coliags_plugin.reporting.model import Chart, Figures, Series
 
 #: What is drawn: key of a row, axis label, whether the axis is logarithmic.
 PANELS = (

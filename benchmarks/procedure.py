@@ -35,6 +35,7 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import read_rgb
 from coliags_plugin.core.json_files import read_json
 from coliags_plugin.core.scene_files import read_intrinsics
+from coliags_plugin.datamanagers.colmap import read_atlas
 from coliags_plugin.datamanagers.reading.depth import C3VD_DEPTH
 from coliags_plugin.geometry.lenses.models import PinholeLens
 from coliags_plugin.geometry.meshes.mesh import TriangleMesh, read_mesh
@@ -253,7 +254,7 @@ class Judge:
         numbers = np.arange(contents.video.first, contents.video.stop)
         is_tissue, is_posed = truth.phantom(numbers) >= 0, np.isin(numbers, list(contents.posed))
         segments = [truth.is_wrong(join, models) for join in contents.joins if join.joined]
-        within = [wrong for one in contents.segments for wrong in truth.wrong_within(one, models)]
+        within = [wrong for one in contents.segments for wrong in truth.wrong_within(self.out, one, models)]
         show(rows, self.json)
         print()
         counts = {
@@ -411,9 +412,10 @@ class Truth:
         first, second = (models[key] for key in join.keys)
         return self._wrong(first.beside(second.moved(np.array(join.transform))), int(first.frames.max()))
 
-    def wrong_within(self, segment: SegmentContents, models: Mapping[ModelKey, Model]) -> list[bool | None]:
+    def wrong_within(self, out: Path, segment: SegmentContents, models: Mapping[ModelKey, Model]) -> list[bool | None]:
         """Whether each join within the models of a segment contradicts the true poses; None for too few frames."""
-        after = [number for number, place in segment.places.items() if place.joined]
+        atlas, numbers = read_atlas(out / segment.span.name / "poses"), {name: n for n, name in segment.used.items()}
+        after = [numbers[atlas.frames[place.after]] for place in atlas.joins if place.joined] if atlas else []
         owners = [[one for one in segment.submaps if number in one.names] for number in after]
         return [self._wrong(models[own[0].key], number) for own, number in zip(owners, after, strict=True) if own]
 

@@ -74,9 +74,9 @@ class PosesSfmCommand:
         assignments += [] if self.params is None else [f"camera.params=[{self.params}]"]
         frames, settings = opened_recording(self.frames, settings_of(SfmSettings, [*assignments, *self.set]))
         survey = FrameSurvey(frames)
-        with progress_callback() as progress, image_files(frames, progress, survey.add) as files:
+        with progress_callback() as progress, image_files(frames, progress) as files:
             images = files[:: self.every][: self.max_frames]
-            for path in images if frames.is_dir() else ():
+            for path in images if frames.is_dir() else files:
                 survey.add(read_image(path))
             masks: Masks = (surveyed := survey.mask())
             if self.mask is not None:
@@ -306,7 +306,7 @@ class PosesExportCommand:
 
     def run(self) -> None:
         """Export, and print the sub-maps."""
-        from coliags_plugin.pipeline.export import MANIFEST, export_atlas
+        from coliags_plugin.pipeline.contents import MANIFEST, export_atlas
 
         manifest = export_atlas(self.reconstruction, self.output, self.overwrite, self.link)
         lines = [
@@ -315,7 +315,6 @@ class PosesExportCommand:
             + (f", joined to {submap['joined_to']}" if submap["joined_to"] != submap["name"] else "")
             for submap in manifest["submaps"]
         ]
-        lines += [f"not read: {problem}" for problem in manifest["not_read"]]
         print_summary("\n".join(lines), manifest, written=[self.output / MANIFEST], as_json=self.json)
 
 

@@ -1,11 +1,12 @@
-"""Contents of the folder of a reconstruction: video, segments, sub-maps, why frames have no pose, problems."""
+"""Contents of the folder of a reconstruction: video, segments, sub-maps, why frames have no pose; and their export."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+import shutil
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -14,19 +15,23 @@ from jaxtyping import Float, Float64
 from pydantic import BaseModel
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.scene_files import Unit
+from coliags_plugin.core.files import atomic_folder, link_or_copy, make_folder, refuse_overlap, write_json
+from coliags_plugin.core.scene_files import FRAME_SUFFIXES, Unit, write_unit
 from coliags_plugin.core.settings import invalid_reported
-from coliags_plugin.datamanagers.colmap import AtlasJoin, AtlasRecord, read_atlas
+from coliags_plugin.datamanagers.colmap import ATLAS_FILE, AtlasRecord, read_atlas
+from coliags_plugin.geometry.poses import colmap, tum
+from coliags_plugin.geometry.poses.trajectory import Trajectory
 from coliags_plugin.pipeline.frames import IMAGES, FramesRecord
 from coliags_plugin.pipeline.joins import ModelKey, SegmentJoin
 from coliags_plugin.pipeline.stages import MADE, RECORD_FILE, SHARED, Record, StageRecord
 from coliags_plugin.pipeline.survey import SURVEY_FILE, Segment, Survey, Video
 
+#: Name of the record of an export, and version of its schema.
+MANIFEST, _FORMAT = "manifest.json", 1
 _FRAME_NAME = re.compile(r"frame_(\d+)")
 #: Figures that are words.
 _TEXTS = ("unit", "depth_scale")
 
-T = TypeVar("T")
 ModelT = TypeVar("ModelT", bound=BaseModel)
 
 
@@ -92,16 +97,14 @@ class SubmapContents:
 
 @dataclass(frozen=True)
 class SegmentContents:
-    """A segment, as far as it can be read."""
+    """A segment, as far as it was reconstructed."""
 
     span: Segment
     stages: Mapping[str, StageRecord]  # by their names within it
     submaps: Sequence[SubmapContents]  # the largest first
-    places: Mapping[int, AtlasJoin]  # between two stretches of frames, by the last frame before
     images: Path  # folder of the frames of use
     used: Mapping[int, str]  # names of the frames of use, by their number in the video
     lost: Mapping[int, str]  # why frames have no pose, by their numbers
-    problem: str = ""  # what of it cannot be read, and why
 
     @property
     def posed(self) -> set[int]:
@@ -115,8 +118,6 @@ class SegmentContents:
         for name, stage in largest.items():
             if stage.state == "failed":
                 return f"{name}{'' if name in SHARED else ' of its largest sub-map'} failed: {stage.summary}"
-        if self.problem:
-            return self.problem
         if not self.stages:
             return "it was not begun"
         return "" if "report" in largest and largest["report"].state == "done" else "it is not finished"
@@ -132,7 +133,6 @@ class Contents:
     segments: Sequence[SegmentContents]
     joins: Sequence[SegmentJoin] = ()
     survey: Survey | None = None
-    problems: Sequence[str] = ()  # what cannot be read, and why
 
     @cached_property
     def submaps(self) -> list[SubmapContents]:
@@ -169,32 +169,32 @@ class _Joins(BaseModel):
 
 
 def read_contents(out: Path, record: Record | None = None, scene: Path | None = None) -> Contents:
-    """Read the folder of a reconstruction; of damaged parts, what is wrong with them becomes a problem.
-
-    ``scene`` is where poses are, if they were given.
+    """Read the folder of a reconstruction, as far as there are files; ``scene`` is where poses are, if they were given.
 
     Raises:
-        InputError: Its record is damaged, or there is none.
+        InputError: A file is damaged, or there is no record.
     """
     record = record or Record.of(out)
-    stages, problems = record.stages, list[str]()
+    stages = record.stages
     if not stages:
         raise InputError(f"no stage in {out / RECORD_FILE}", "the folder of a reconstruction, which has begun")
     posed = None if "survey" in stages else scene
     if record.is_done("survey"):
         video = figures_as(stages, "survey", Video, out)
     else:
-        atlas = None if posed is None else _attempt(partial(read_atlas, posed), out, problems)
+        atlas = None if posed is None else read_atlas(posed)
         count = len(atlas.frames) if atlas else 0
         segments = (Segment(0, max(0, count - 1), ""),)
         video = Video(source=(scene or out).resolve().name, frames=max(1, count), segments=segments)
     contents = [_read_segment(out / span.name, span, record.within(span.name), video, posed) for span in video.segments]
-    problems += [
-        ": ".join(filter(None, (segment.span.name, segment.problem))) for segment in contents if segment.problem
-    ]
-    survey = _attempt(partial(_read_survey, out, video), out, problems)
     joins = figures_as(stages, "joins", _Joins, out).joins if "joins" in stages else []
-    return Contents(out, video, stages, contents, joins, survey, problems)
+    survey = Survey.read(out) if (out / SURVEY_FILE).is_file() else None
+    if survey is not None:
+        if not survey.first <= video.first < video.stop <= survey.first + len(survey):
+            seen = f"{out / SURVEY_FILE} has {len(survey)} frames"
+            raise InputError(seen, f"a number for each of {video.frames} frames")
+        survey = survey.part(video.first, video.stop - 1)
+    return Contents(out, video, stages, contents, joins, survey)
 
 
 def figures_as(stages: Mapping[str, StageRecord], name: str, kind: type[ModelT], folder: Path) -> ModelT:
@@ -207,36 +207,17 @@ def figures_as(stages: Mapping[str, StageRecord], name: str, kind: type[ModelT],
         return kind.model_validate(stages[name].figures)
 
 
-def _read_survey(out: Path, video: Video) -> Survey | None:
-    """Read the survey of a video's frames; None without one."""
-    if not (out / SURVEY_FILE).is_file():
-        return None
-    survey = Survey.read(out)
-    if not survey.first <= video.first < video.stop <= survey.first + len(survey):
-        raise InputError(f"{out / SURVEY_FILE} has {len(survey)} frames", f"a number for each of {video.frames} frames")
-    return survey.part(video.first, video.stop - 1)
-
-
-def _attempt(read: Callable[[], T], folder: Path, problems: list[str]) -> T | None:
-    """Read a file; None if it is damaged, which is noted without the place of the folder, as that may be moved."""
-    try:
-        return read()
-    except InputError as error:
-        problems.append(str(error).replace(f"{folder}/", "").replace(str(folder), folder.name))
-        return None
-
-
 def _read_segment(
     folder: Path, span: Segment, stages: Mapping[str, StageRecord], video: Video, posed: Path | None
 ) -> SegmentContents:
     """Read a segment; ``posed`` is a scene whose poses were given: its frames are those of its atlas."""
-    problems, places, lost = list[str](), dict[int, AtlasJoin](), dict[int, str]()
-    atlas = _attempt(partial(read_atlas, posed or folder / "poses"), folder, problems)
+    scene, lost = posed or folder / "poses", dict[int, str]()
+    atlas = read_atlas(scene)
     if posed is not None:
         images, used = posed / IMAGES, dict(enumerate(atlas.frames if atlas else ()))
     else:
         images, used = folder / "frames" / IMAGES, {}
-        if frames := _attempt(partial(FramesRecord.read, folder / "frames"), folder, problems):
+        if frames := FramesRecord.read(folder / "frames"):
             lost = {frame.frame: frame.why for frame in frames.dropped}
             used = {frame.frame: f"{frame.name}.png" for frame in frames.kept if span.first <= frame.frame <= span.last}
     by_submap: dict[int, dict[str, StageRecord]] = {}
@@ -249,7 +230,6 @@ def _read_segment(
         try:
             numbers = _frame_numbers(atlas, {Path(name).stem: number for number, name in used.items()}, video)
             lost |= {numbers[frame.frame]: frame.reason for frame in atlas.lost}
-            places = {numbers[place.after]: place for place in atlas.joins}
             names: dict[str, dict[int, str]] = {}
             for stretch in atlas.submaps:
                 in_stretch = {numbers[frame]: atlas.frames[frame] for frame in stretch.frames}
@@ -261,9 +241,8 @@ def _read_segment(
                 submaps[number] = SubmapContents(span.name, model, by_submap.get(number, {}), ordered, units[model])
         except (LookupError, ValueError) as error:
             text = f"{error}".encode(errors="backslashreplace").decode()  # a name may be any text
-            problems.append(f"poses/atlas.json does not fit the frames: {text}")
-    largest_first = [submaps[number] for number in sorted(submaps)]
-    return SegmentContents(span, stages, largest_first, places, images, used, lost, "; ".join(problems))
+            raise InputError(f"{scene / ATLAS_FILE} does not fit the frames: {text}", MADE) from error
+    return SegmentContents(span, stages, [submaps[number] for number in sorted(submaps)], images, used, lost)
 
 
 def _frame_numbers(atlas: AtlasRecord, numbers: Mapping[str, int], video: Video) -> list[int]:
@@ -306,3 +285,87 @@ def common_frames(contents: Contents) -> dict[ModelKey, tuple[ModelKey, Float[np
                     placed[other] = submap.key, placed[key][1] @ to_key
                     reached.append(other)
     return placed
+
+
+def export_atlas(out: Path, folder: Path, overwrite: bool = False, link: bool = False) -> dict[str, Any]:
+    """Export every sub-map of a video into a folder; returns the content of ``manifest.json``.
+
+    A folder has (docs/reconstruct.md 9): ``colmap/`` with the posed images and the model, ``nerfstudio/`` with dense
+    depth where it was estimated, and ``trajectory.txt`` in TUM's format, camera to world, at seconds of the video, or
+    frame numbers where its rate is unknown. The manifest has, for each, the similarity from its world to that of the
+    first one that it is joined to. With ``link``, images and depth are second names of the files in ``out``, where both
+    are on one disk.
+
+    Raises:
+        InputError: ``out`` is of no video, has no poses, or is damaged; or ``folder`` is there without ``overwrite``.
+    """
+    contents = read_contents(out)
+    submaps, video = {submap.key: submap for submap in contents.submaps if submap.names}, contents.video
+    if not submaps:
+        raise InputError(f"{out} has no sub-map with poses", "at least one")
+    refuse_overlap(folder, out)
+    entries = []
+    with atomic_folder(folder, overwrite) as scratch:
+        for key, (first, to_first) in common_frames(contents).items():
+            submap = submaps[key]
+            place = f"{submap.segment or 'submap'}-{submap.number}"
+            has_depth = _write_submap(contents, submap, scratch / place, link)
+            entries.append(
+                {
+                    "name": submap.name,
+                    "folder": place,
+                    "frames": list(submap.names),
+                    "unit": submap.unit,
+                    "nerfstudio": has_depth,
+                    "joined_to": submaps[first].name,
+                    "to_joined": to_first.tolist(),
+                }
+            )
+        manifest = {
+            "format": _FORMAT,
+            "source": [video.source],
+            "frames": video.frames,
+            "rate": video.rate,
+            "size": list(video.size or ()),
+            "timestamps": "frame number" if video.rate is None else "s",
+            "submaps": entries,
+            "joins": [join.model_dump(mode="json") for join in contents.joins],
+        }
+        write_json(scratch / MANIFEST, manifest)
+    return manifest
+
+
+def _write_submap(contents: Contents, submap: SubmapContents, folder: Path, link: bool) -> bool:
+    """Write the files of one sub-map; returns True if there is dense depth.
+
+    Images are linked where asked for; all else, which programs write anew, is copied.
+    """
+    scene, depth = contents.folder / submap.segment / "poses", contents.folder / submap.folder / "depth"
+    model = scene / submap.model
+    poses = colmap.read(model)
+    numbers = {name: number for number, name in submap.names.items()}
+    names = poses.names_or_numbers()
+    if set(names) != set(numbers):
+        raise InputError(
+            f"{model} has {len(names)} frames, and the atlas of its scene names {len(numbers)} of it",
+            "the same frames",
+            "Restore the segment, or reconstruct it again",
+        )
+    frames = np.array([numbers[name] for name in names])
+    order = np.argsort(frames)
+    make_folder(folder)
+    trajectory = Trajectory(poses.camera_to_world[order], timestamps=contents.seconds(frames[order]))
+    tum.write(folder / "trajectory.txt", trajectory)
+    files = {f"colmap/images/{name}": scene / "images" / name for name in names}
+    files |= {f"colmap/masks/{name}.png": mask for name in names if (mask := scene / f"masks/{name}.png").is_file()}
+    files |= {f"colmap/sparse/0/{file.name}": file for file in sorted(model.iterdir())}
+    has_depth = bool(submap.stages) and (depth / "transforms.json").is_file()
+    for file in sorted(depth.rglob("*")) if has_depth else ():
+        if file.is_file():
+            files[f"nerfstudio/{file.relative_to(depth).as_posix()}"] = file
+    for place, file in files.items():
+        make_folder((folder / place).parent)
+        is_image = file.suffix.lower() in FRAME_SUFFIXES
+        (link_or_copy if link and is_image else shutil.copyfile)(file, folder / place)
+    write_unit(folder / "colmap", submap.unit)
+    return has_depth

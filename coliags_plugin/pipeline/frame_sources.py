@@ -1,14 +1,15 @@
-"""Frames of a video file or of a folder of images, one after the other, and calibrations beside them."""
+"""Frames of a video file or of a folder of images, one after the other, deinterlaced, and calibrations beside them."""
 
 from __future__ import annotations
 
 import logging
 import sys
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -21,16 +22,21 @@ from coliags_plugin.core.jobs import Progress
 from coliags_plugin.core.scene_files import FRAME_SUFFIXES
 from coliags_plugin.engine.data_formats import videos_in
 from coliags_plugin.geometry.lenses.vicalib import SUFFIX, find_calibration, read_calibration
-from coliags_plugin.pipeline.frame_selection import looks_interlaced, one_field
 from coliags_plugin.pipeline.settings import FrameSettings
 from coliags_plugin.pipeline.video_files import AS_IMAGES, VideoFile, video_file
-from coliags_plugin.reconstruction.structure.image_files import file_names, list_images, read_image
+from coliags_plugin.reconstruction.structure.image_files import file_names, is_repeated, list_images, read_image
 from coliags_plugin.reconstruction.structure.sfm_settings import SfmSettings, camera_of_lens
 
 log = logging.getLogger(__name__)
 
 #: Share of the frames looked at that are flagged as interlaced above which all are deinterlaced.
-_INTERLACED = 0.1
+_FLAGGED = 0.1
+#: Ratio of the differences of neighbouring rows and of rows two apart above which a frame is interlaced: 0.5 to 0.7 in
+#: images, 1 for noise alone, 1.1 where that is sharpened, 1.4 to 9 where two fields show a scene that moves fast. Slow
+#: motion combs little: hence the percentile, over frames that change, of a video's ratios.
+_INTERLACED, _PERCENTILE = 1.3, 90.0
+#: Frames that change which are looked at, from the first on, and frames among which they are sought.
+_CHANGING, _LOOKED_AT = 300, 3000
 
 
 @dataclass(frozen=True)
@@ -67,12 +73,8 @@ class FrameSource:
         """Number of frames, at least 1: for progress, of one file about so many."""
         if not self.videos:
             return self.span.count(len(self._images))
-        return self.span.count(self.videos[0].expected if len(self.videos) == 1 else self._count)
-
-    @property
-    def _count(self) -> int:
-        """Number of frames of all files."""
-        return sum(video.count for video in self.videos)
+        first, *others = self.videos
+        return self.span.count(sum(video.count for video in self.videos) if others else first.expected)
 
     @property
     def rate(self) -> float | None:
@@ -197,7 +199,7 @@ def chosen_frames(path: Path, settings: FrameSettings) -> FrameSource:
             flags.append(is_interlaced)
             yield image
 
-    if not (looks_interlaced(images()) or np.mean(flags) > _INTERLACED):
+    if not (looks_interlaced(images()) or np.mean(flags) > _FLAGGED):
         return source
     log.info(
         "%s is interlaced: of every frame, which shows two moments in alternate rows, one field is kept and the rows "
@@ -205,6 +207,32 @@ def chosen_frames(path: Path, settings: FrameSettings) -> FrameSource:
         path,
     )
     return replace(source, span=replace(source.span, deinterlace=True))
+
+
+def looks_interlaced(images: Iterable[UInt8[np.ndarray, "H W 3"]]) -> bool:
+    """True if frames of a video show two moments each, by the first of them that differ from the one before."""
+    combs, last = list[float](), None
+    for image in islice(images, _LOOKED_AT):
+        if last is not None and not is_repeated(last, image):
+            green = image[..., 1].astype(np.int16)
+            between_fields, within_field = (np.abs(green[step:] - green[:-step]).mean() for step in (1, 2))
+            combs.append(float(between_fields / max(within_field, 1e-6)))
+        last = image
+        if len(combs) == _CHANGING:
+            break
+    return bool(combs) and bool(np.percentile(combs, _PERCENTILE) > _INTERLACED)
+
+
+def one_field(image: UInt8[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "H W 3"]:
+    """A frame of one moment: the even rows, from the first, and means of those above and below in place of the odd.
+
+    The rows of an interlaced frame show two moments in turn, while a pose is that of one. Which is the earlier does not
+    matter: the even rows of all frames are equally far apart in time.
+    """
+    whole = image.copy()
+    whole[1::2] = image[:-1:2]  # the last row has none below
+    whole[1:-1:2] = (image[:-2:2].astype(np.uint16) + image[2::2] + 1) // 2
+    return whole
 
 
 def watched(
@@ -219,15 +247,10 @@ def watched(
 
 
 @contextmanager
-def image_files(
-    source: Path,
-    progress: Progress | None = None,
-    look: Callable[[UInt8[np.ndarray, "H W 3"]], None] | None = None,
-) -> Iterator[list[Path]]:
+def image_files(source: Path, progress: Progress | None = None) -> Iterator[list[Path]]:
     """Image files of a folder, or of a video's frames, which are written to a temporary folder without loss.
 
-    ``look`` is given every frame of a video. A video that looks interlaced is deinterlaced; images of a folder are as
-    they are.
+    A video that looks interlaced is deinterlaced; images of a folder are as they are.
 
     Raises:
         InputError: As :func:`frame_source`, or a frame cannot be read.
@@ -241,8 +264,6 @@ def image_files(
         for name, image in watched(frames, "read frames", progress):
             files.append(Path(scratch) / f"{name}.png")
             write_image(files[-1], image)
-            if look is not None:
-                look(image)
         yield files
 
 

@@ -1,13 +1,15 @@
-"""Writes the frames of a video that are of use, without loss, with a record of those that are not."""
+"""Chooses the frames of a video that are of use and writes them without loss, with a record of the others."""
 
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float64
 from pydantic import BaseModel, ConfigDict, Field
 
 from coliags_plugin.core.errors import InputError
@@ -16,21 +18,17 @@ from coliags_plugin.core.images import write_image, write_mask
 from coliags_plugin.core.jobs import Progress
 from coliags_plugin.core.settings import read_validated
 from coliags_plugin.datamanagers.reading.images import read_mask
-from coliags_plugin.pipeline.frame_selection import (
-    RESTING,
-    THINNED,
-    blurred_frames,
-    corner_motion,
-    reduced,
-    sharpest_frames,
-)
 from coliags_plugin.pipeline.frame_sources import FrameSource, watched
 from coliags_plugin.pipeline.settings import FEWEST, FrameSettings
 from coliags_plugin.pipeline.stages import MADE
-from coliags_plugin.pipeline.survey import Survey
+from coliags_plugin.pipeline.survey import Survey, corner_motion, reduced
 
 #: Names within the folder.
 IMAGES, MASK, RECORD = "images", "mask.png", "frames.json"
+#: Why frames are dropped, as the record says it.
+THINNED, EMPTY, RESTING = "thinned out", "black or without any texture", "the camera rests"
+#: Neighbours to either side, of the frames left by thinning, that a frame's sharpness is compared with.
+_NEIGHBOURS = 10
 #: Name of a frame's file without its suffix, within its folder.
 FrameName = Annotated[str, Field(pattern=r"^[^/\\]+$")]
 _KEEP_MORE = ", or keep more frames with `every`, `frames.least_motion=0` or `frames.least_sharpness=0`"
@@ -46,7 +44,6 @@ class KeptFrame(_Part):
     frame: int  # number in the video
     name: FrameName
     blurred: bool  # of use for poses alone
-    sharpness: float = 0.0
 
 
 class DroppedFrame(_Part):
@@ -54,7 +51,6 @@ class DroppedFrame(_Part):
 
     frame: int
     why: str
-    sharpness: float = 0.0
 
 
 class FramesRecord(_Part):
@@ -62,17 +58,39 @@ class FramesRecord(_Part):
 
     kept: list[KeptFrame]
     dropped: list[DroppedFrame]  # but those that were thinned out
-    source: str = ""  # name of the video
-    frames: int = 0  # that it has
-    every: int = 1
-    deinterlaced: bool = False
-    size: list[int] = []  # width and height, pixels
-    masked: float | None = None  # share of the image; None: there is no mask
 
     @classmethod
     def read(cls, folder: Path) -> FramesRecord | None:
         """Read ``frames.json`` in a folder of frames; None where it is missing, InputError where it is damaged."""
         return read_validated(cls, folder / RECORD, MADE) if (folder / RECORD).is_file() else None
+
+
+def sharpest_frames(
+    sharpness: Sequence[float], settings: FrameSettings, times: Float64[np.ndarray, "N"] | None = None
+) -> tuple[list[int], dict[int, str]]:
+    """Frames to use by the sharpness of every frame: ascending indices, and why each of the others is dropped.
+
+    ``times``, s, count for ``settings.per_second``.
+    """
+    values, part = np.asarray(sharpness), np.arange(len(sharpness)) // settings.every
+    if settings.per_second is not None and times is not None:
+        part = np.floor(times * settings.per_second + 1e-6).astype(int)
+    bounds = [*np.flatnonzero(np.diff(part, prepend=-1)).tolist(), len(values)]
+    best = [first + int(np.argmax(values[first:stop])) for first, stop in pairwise(bounds)]
+    dropped = dict.fromkeys(set(range(len(values))) - set(best), THINNED)
+    some = [index for index in best if values[index] > 0.0]
+    return some, dropped | dict.fromkeys(set(best) - set(some), EMPTY)
+
+
+def blurred_frames(chosen: Sequence[int], sharpness: Sequence[float], settings: FrameSettings) -> set[int]:
+    """Frames among the chosen ones, ascending, that are much less sharp than those around them."""
+    values = np.asarray(sharpness)
+    return {
+        index
+        for place, index in enumerate(chosen)
+        if values[index]
+        < settings.least_sharpness * np.median(values[chosen[max(0, place - _NEIGHBOURS) : place + _NEIGHBOURS + 1]])
+    }
 
 
 def write_frames(
@@ -105,8 +123,8 @@ def write_frames(
             if last is not None and corner_motion(last, gray, used)[0] < settings.least_motion:
                 dropped[index] = RESTING
                 continue
-            last, is_blurred = gray, index in blurred
-            frames.append(KeptFrame(frame=first + index, name=name, blurred=is_blurred, sharpness=sharpnesses[index]))
+            last = gray
+            frames.append(KeptFrame(frame=first + index, name=name, blurred=index in blurred))
             write_image(scratch / IMAGES / f"{name}.png", source.with_alpha(name, image))
         reasons = [f"{count} {why}" for why, count in sorted(Counter(dropped.values()).items())]
         if unsharp := sum(frame.blurred for frame in frames):
@@ -120,20 +138,8 @@ def write_frames(
             )
         if used is not None:
             write_mask(scratch / MASK, used)
-        record = FramesRecord(
-            kept=frames,
-            dropped=[
-                DroppedFrame(frame=first + index, why=why, sharpness=sharpnesses[index])
-                for index, why in sorted(dropped.items())
-                if why != THINNED
-            ],
-            source=source.path.name,
-            frames=len(survey),
-            every=settings.every,
-            deinterlaced=bool(source.span.deinterlace),
-            size=[width, height],
-            masked=None if used is None else round(float(1.0 - used.mean()), 4),
-        )
+        left_out = [(first + index, why) for index, why in sorted(dropped.items()) if why != THINNED]
+        record = FramesRecord(kept=frames, dropped=[DroppedFrame(frame=frame, why=why) for frame, why in left_out])
         write_json(scratch / RECORD, record.model_dump(mode="json"))
     outside = "" if used is None else f"{100.0 * (1.0 - used.mean()):.0f} % of the image masked"
     size = f"{width} x {height} px{', deinterlaced' if source.span.deinterlace else ''}"

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from itertools import pairwise
 from pathlib import Path
 from urllib.parse import quote
 
@@ -24,11 +22,9 @@ from coliags_plugin.pipeline.timeline import (
     clock,
     clock_span,
     frame_states,
-    reasons,
     span_text,
     stretches,
     timeline,
-    why_apart,
 )
 from coliags_plugin.reporting.html_page import write_html
 from coliags_plugin.reporting.image_files import EncodedImage
@@ -50,8 +46,9 @@ from coliags_plugin.reporting.model import (
     Value,
     as_cell,
     ranked_cells,
+    simple_table,
 )
-from coliags_plugin.reporting.numbers import area_text, counted, duration
+from coliags_plugin.reporting.numbers import area_text, counted, duration, letters
 
 #: Largest page, bytes, and how much of it are scenes.
 _LIMIT, _SCENES = 50_000_000, 36_000_000
@@ -63,8 +60,6 @@ _KINDS = ("recorded.png", "depth.png", "flattened light.png")
 _LISTED = 200
 #: Items named in a sentence, and sentences about what limits the result; rows of a table above which it is folded.
 _NAMED = 5
-#: Figures of a sub-map that have a mean over all, with their units.
-_MEASURED = {"psnr": "dB", "ssim": "1", "psnr_pose_refined": "dB", "psnr_training": "dB", "gap": "dB"}
 #: Columns that are left out where no sub-map has them.
 _WHERE_KNOWN = ("span", "group", "psnr_pose_refined", "seen")
 _TIMELINE = (
@@ -82,11 +77,11 @@ _SUSPECT = (
 def write_page(out: Path, record: Record | None = None, scene: Path | None = None) -> None:
     """Write ``index.html`` into the folder of a reconstruction: one file that opens offline.
 
-    It has at most 50 MB; scenes and pictures that have no room in it are loaded from the folder. Parts that are damaged
-    or missing are said to be, and the others shown. ``scene`` is where poses are, if they were given.
+    It has at most 50 MB; scenes and pictures that have no room in it are loaded from the folder. ``scene`` is where
+    poses are, if they were given.
 
     Raises:
-        InputError: ``out`` is of no reconstruction, or its record is damaged; or the page cannot be written.
+        InputError: ``out`` is of no reconstruction, or a file in it is damaged; or the page cannot be written.
     """
     contents = read_contents(out, record, scene)
     states = frame_states(contents)
@@ -94,14 +89,14 @@ def write_page(out: Path, record: Record | None = None, scene: Path | None = Non
         Section("Scenes", list(_scenes(contents))),
         Section("Depth and light", list(_pictures(contents))),
         *_views(contents),
-        Section("Sub-maps", list(_submaps(contents, states))),
+        Section("Sub-maps", list(_submaps(contents))),
     ]
     if contents.has_frames:
         sections.insert(0, Section("Time line", [Paragraph(_TIMELINE), timeline(contents, states)]))
         sections.append(Section("Frames without a pose", list(_without_pose(contents, states))))
     sections.append(Section("Stages and files", list(_stages(contents))))
-    title, facts, cautions = f"Reconstruction of {contents.video.source}", list(_facts(contents)), remarks(contents)
-    page = Page(title, sections, facts, "For research use only.", [*contents.problems, *cautions])
+    title = f"Reconstruction of {contents.video.source}"
+    page = Page(title, sections, list(_facts(contents)), "For research use only.", remarks(contents))
     write_html(page, out / PAGE_FILE, _LIMIT)
 
 
@@ -165,29 +160,25 @@ def remarks(contents: Contents) -> list[str]:
         failures.insert(0, f"no frame of this video has a pose{why}")
     suspect = [submap for submap in contents.submaps if "check" in submap.stages and submap.stages["check"].warnings]
     if suspect:
-        names = _enumerated([f"{submap.name} ({submap.stages['check'].summary})" for submap in suspect])
-        failures.append(f"the poses of {names}: {_SUSPECT}")
+        names = ", ".join(f"{submap.name} ({submap.stages['check'].summary})" for submap in suspect[:_NAMED])
+        others = f", and {len(suspect) - _NAMED} others" if len(suspect) > _NAMED else ""
+        failures.append(f"the poses of {names}{others}: {_SUSPECT}")
     texts = [*failures, *warnings]
     rest = len(texts) - _NAMED
     return texts if rest < 2 else [*texts[:_NAMED], f"{rest} more, under Stages and files of {PAGE_FILE}"]
 
 
-def _enumerated(items: Sequence[str]) -> str:
-    rest = f", and {len(items) - _NAMED} others" if len(items) > _NAMED else ""
-    return f"{', '.join(items[:_NAMED])}{rest}"
-
-
-def _joins(contents: Contents, states: Sequence[State]) -> Iterator[Block]:
-    """Joins of segments, and why other sub-maps that follow each other are apart."""
-    columns = [
-        Column("Sub-maps"),
+def _joins(contents: Contents) -> Table:
+    """Joins of segments."""
+    head: list[str | Column] = [
+        "Sub-maps",
         Column("Result", words=True),
-        Column("Shared frames"),
+        "Shared frames",
         Column("Rotation", unit="degrees"),
         Column("Position", unit="% of the depth"),
         Column("Why apart", words=True),
     ]
-    rows: list[list[Value | TableCell]] = [
+    rows: list[list[Value]] = [
         [
             " and ".join("/".join(filter(None, (name, Path(model).name))) for name, model in join.keys),
             "joined" if join.joined else "apart",
@@ -198,25 +189,15 @@ def _joins(contents: Contents, states: Sequence[State]) -> Iterator[Block]:
         ]
         for join in contents.joins
     ]
-    compared = [join.segments for join in contents.joins]
-    for submap, following in pairwise(submap for submap in contents.submaps if submap.names):
-        if (submap.segment, following.segment) not in compared:
-            why = why_apart(contents, states, submap, following)
-            rows.append([f"{submap.name} and {following.name}", "apart", None, None, None, why])
-    if rows:
-        yield Folded("Joins of sub-maps", [_table_of(columns, rows, "joins")], is_open=len(rows) <= _NAMED)
+    return simple_table(head, rows, "joins")
 
 
 def _groups(contents: Contents) -> dict[ModelKey, str]:
     """Letters of sub-maps that are joined to others, A to Z and then AA."""
     first_of = {key: first for key, (first, _) in common_frames(contents).items()}
     sizes = Counter(first_of.values())
-    letters = {key: _letter(number) for number, key in enumerate(key for key in first_of if sizes[key] > 1)}
-    return {key: letters[first] for key, first in first_of.items() if first in letters}
-
-
-def _letter(number: int) -> str:
-    return (chr(ord("A") + number // 26 - 1) if number >= 26 else "") + chr(ord("A") + number % 26)
+    groups = {key: letters(number).upper() for number, key in enumerate(key for key in first_of if sizes[key] > 1)}
+    return {key: groups[first] for key, first in first_of.items() if first in groups}
 
 
 def _longest_first(contents: Contents) -> list[SubmapContents]:
@@ -267,36 +248,34 @@ def _views(contents: Contents) -> list[Section]:
     from coliags_plugin.comparison.report.study import Study
     from coliags_plugin.comparison.report.views import view_section
 
-    by_psnr = sorted(
-        (submap for submap in contents.submaps if "psnr" in submap.figures), key=lambda submap: submap.figures["psnr"]
-    )
-    shown = [submap.key for submap in (*by_psnr[: _SUBMAPS // 2], *by_psnr[-_SUBMAPS // 2 :])]
+    half, by_psnr = _SUBMAPS // 2, [submap for submap in contents.submaps if "psnr" in submap.figures]
+    by_psnr.sort(key=lambda submap: submap.figures["psnr"])
     runs = []
-    for submap in contents.submaps:
-        for path in submap.stages["evaluate"].files if submap.key in shown else ():
-            evaluation = contents.folder / path
-            with suppress(InputError):
+    try:
+        for submap in sorted([*by_psnr[:half], *by_psnr[half:][-half:]], key=lambda submap: submap.first):
+            for path in submap.stages["evaluate"].files:
+                evaluation = contents.folder / path
                 run = read_study([evaluation.parent.parent], evaluation.name).runs[0]
                 scene = run.result.scene.model_copy(update={"name": submap.name})
                 runs.append(replace(run, result=run.result.model_copy(update={"scene": scene})))
-    try:
         section = [view_section(Study(tuple(runs)), runs[0].method, _VIEWS)] if runs else []
     except InputError as error:
         why = str(error).replace(f"{contents.folder}/", "").replace(str(contents.folder), contents.folder.name)
         return [Section("Held-out views", [Paragraph(why, hint=False)])]
     if section and len(by_psnr) > _SUBMAPS:
-        hint = Paragraph(f"Of {len(by_psnr)} sub-maps, the {_SUBMAPS // 2} with the lowest and with the highest PSNR.")
+        hint = Paragraph(f"Of {len(by_psnr)} sub-maps, the {half} with the lowest and with the highest PSNR.")
         return [replace(section[0], blocks=[hint, *section[0].blocks])]
     return section
 
 
-def _submaps(contents: Contents, states: Sequence[State]) -> Iterator[Block]:
+def _submaps(contents: Contents) -> Iterator[Block]:
     """Figures of the sub-maps, and their joins."""
     if contents.submaps:
         yield submap_table(contents)
-        yield from _joins(contents, states)
     else:
         yield Paragraph("No sub-map was reconstructed.", hint=False)
+    if contents.joins:
+        yield Folded("Joins of segments", [_joins(contents)], is_open=len(contents.joins) <= _NAMED)
 
 
 def submap_table(contents: Contents) -> Table:
@@ -325,7 +304,7 @@ def submap_table(contents: Contents) -> Table:
             "submap": submap.name,
             "span": span_text(contents, submap.first, submap.last).removeprefix("frames ") if submap.names else None,
             "group": groups.get(submap.key),
-            "area": _area_of(submap),
+            "area": _area_of(submap, "area"),
             "seen": _seen_of(submap),
             "time": duration(sum(stage.seconds for stage in submap.stages.values())) if submap.stages else None,
         }
@@ -333,13 +312,15 @@ def submap_table(contents: Contents) -> Table:
     ]
     if len(submaps) > 1:
         rows.append({"submap": "mean"})
-    for key, unit in _MEASURED.items():
-        values = [submap.figures.get(key) for submap in submaps]
+    for column in columns:
+        if not column.unit:
+            continue
+        values = [submap.figures.get(column.key) for submap in submaps]
         if len(submaps) > 1:
             numbers = [value for value in values if value is not None]
             values.append(sum(numbers) / len(numbers) if numbers else None)
-        for row, cell in zip(rows, ranked_cells(values, unit, None), strict=True):
-            row[key] = cell
+        for row, cell in zip(rows, ranked_cells(values, column.unit, None), strict=True):
+            row[column.key] = cell
     for row, submap in zip(rows, submaps, strict=False):
         if note := submap.failure or ("" if submap.stages else "too few frames to be reconstructed"):
             row["psnr"] = replace(as_cell(row["psnr"]), note=note)
@@ -348,29 +329,20 @@ def submap_table(contents: Contents) -> Table:
     return Table("", shown, rows, name="submaps")
 
 
-def _area_of(submap: SubmapContents) -> str | None:
-    """Area of the mesh; None where there is none."""
+def _area_of(submap: SubmapContents, name: str) -> str | None:
+    """One of its areas; None where that is unknown."""
     figures = submap.figures
-    return area_text(figures["area"], figures.get("unit") == "mm") if "area" in figures else None
+    return area_text(figures[name], figures.get("unit") == "mm") if name in figures else None
 
 
 def _seen_of(submap: SubmapContents) -> str | None:
     """Share of the wall seen, in per cent, or the seen area where the whole wall is unknown."""
-    figures = submap.figures
-    if "seen" in figures:
-        return f"{100.0 * figures['seen']:.0f} %"
-    return area_text(figures["seen_area"], figures.get("unit") == "mm") if "seen_area" in figures else None
-
-
-def _table_of(columns: Sequence[Column], rows: Iterable[Sequence[Value | TableCell]], name: str = "") -> Table:
-    """A table of rows of as many values as there are columns."""
-    keys = [column.key for column in columns]
-    return Table("", columns, [dict(zip(keys, row, strict=True)) for row in rows], name=name)
+    return f"{100.0 * submap.figures['seen']:.0f} %" if "seen" in submap.figures else _area_of(submap, "seen_area")
 
 
 def _without_pose(contents: Contents, states: Sequence[State]) -> Iterator[Block]:
     """Reasons by how many frames they concern, and the stretches."""
-    counts = reasons(states).most_common()
+    counts = Counter(state for state in states if state.style is None).most_common()
     if not counts:
         yield Paragraph("Every frame has a pose.", hint=False)
         return
@@ -379,8 +351,8 @@ def _without_pose(contents: Contents, states: Sequence[State]) -> Iterator[Block
         [state.why or state.what, state.what, count, TableCell(f"{share:.1f}", share)]
         for (state, count), share in zip(counts, shares, strict=True)
     ]
-    columns = [Column("Why"), Column("What", words=True), Column("Frames"), Column("Share", unit="% of the video")]
-    yield _table_of(columns, rows, "reasons")
+    head: list[str | Column] = ["Why", Column("What", words=True), "Frames", Column("Share", unit="% of the video")]
+    yield simple_table(head, rows, "reasons")
     without = [(stretch, state) for stretch, state in stretches(contents, states) if state.style is None]
     longest = sorted(without, key=lambda pair: -pair[0].count)[:_LISTED]
     listed: list[list[Value]] = [
@@ -392,9 +364,9 @@ def _without_pose(contents: Contents, states: Sequence[State]) -> Iterator[Block
         ]
         for stretch, state in sorted(longest, key=lambda pair: pair[0].first)
     ]
-    table = _table_of([Column(key, words=key != "Number") for key in ("Frames", "From", "Number", "Why")], listed)
+    columns: list[str | Column] = ["Frames", Column("From", words=True), "Number", Column("Why", words=True)]
     shown = f"the {_LISTED} longest of {len(without)}" if len(without) > _LISTED else str(len(without))
-    yield Folded(f"Stretches without a pose ({shown})", [replace(table, name="stretches")])
+    yield Folded(f"Stretches without a pose ({shown})", [simple_table(columns, listed, "stretches")])
 
 
 def _stages(contents: Contents) -> Iterator[Block]:
@@ -422,7 +394,7 @@ def _stages(contents: Contents) -> Iterator[Block]:
             for warning in stage.warnings
         ]
         files = [Bullet(what, path, quote(path)) for stage in of_segment.values() for path, what in stage.files.items()]
-        table = _table_of([Column("stage"), Column("result", words=True), Column("time")], rows)
+        table = simple_table(["stage", Column("result", words=True), "time"], rows)
         blocks: list[Block] = [table, *(Bullets(items) for items in (warnings, files) if items)]
         if of_segment or name:
             yield Folded(title, blocks, is_open=not name)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -125,11 +125,6 @@ class StageContext:
         return self.source if self.data_format is not None else self.out / "poses"
 
     @property
-    def estimated(self) -> Path:
-        """Scene with estimated depth."""
-        return self.folder / "depth"
-
-    @property
     def run(self) -> Path:
         """The trained run."""
         return self.folder / "run"
@@ -152,18 +147,19 @@ class StageContext:
 
     @property
     def scene(self) -> Path:
-        """Scene to train on."""
-        return self.estimated if self.estimates_depth else self.posed
+        """Scene to train on: that with estimated depth, or the source."""
+        return self.folder / "depth" if self.estimates_depth else self.posed
 
     @cached_property
     def estimates_depth(self) -> bool:
         """True if depth has to be estimated, as the source is no scene, or one without dense depth."""
         return self.data_format is None or self._first_frame.depth is None
 
-    @cached_property
-    def has_estimates(self) -> bool:
-        """True if the source is a scene with estimated depth."""
-        return not self.estimates_depth and self._first_frame.depth_confidence is not None
+    @property
+    def method(self) -> str:
+        """Name of the method to train: the one given, or else by what is known of the depth."""
+        is_estimate = self.estimates_depth or self._first_frame.depth_confidence is not None
+        return self.settings.method or ("coliags-in-vivo" if is_estimate else "coliags")
 
     @cached_property
     def _first_frame(self) -> Frame:
@@ -171,43 +167,39 @@ class StageContext:
 
 
 def stages_of(context: StageContext) -> list[Stage]:
-    """The stages of a context, in order: those that all sub-maps of a segment need, or those of one sub-map."""
-    rows = _shared_stages(context) if context.submap is None else _submap_stages(context)
-    return [Stage(context.prefix + name, partial(work, context), options) for work, name, options in rows]
+    """The stages of a context, in order: those that all sub-maps of a segment need, or those of one sub-map.
 
+    A scene with poses has none of the former. The first stage of a sub-map depends on what no stage before it does: the
+    scene, or the other model.
+    """
 
-#: What a stage does, its name, and its options.
-_Row = tuple[Callable[[StageContext], StageRecord], str, Mapping[str, Any]]
+    def stage(name: str, work: Callable[[StageContext], StageRecord], **options: object) -> Stage:
+        return Stage(context.prefix + name, partial(work, context), options)
 
-
-def _shared_stages(context: StageContext) -> Iterator[_Row]:
-    """Stages before those of the sub-maps; none for a scene with poses."""
-    settings = context.settings
-    if context.data_format is None:
+    settings, submap, is_scene = context.settings, context.submap, context.data_format is not None
+    if submap is None:
         mask = None if context.mask is None else identity_of(context.mask)
-        yield make_frames, "frames", {"frames": settings.frames.model_dump(), "mask": mask}
-        yield make_poses, "poses", {"diameter": settings.diameter, "sfm": settings.sfm.model_dump()}
-
-
-def _submap_stages(context: StageContext) -> Iterator[_Row]:
-    """Stages of one sub-map; the first depends on what no stage before it does: the scene, or the other model."""
-    settings, size, model = context.settings, {"size": context.settings.size}, context.submap and context.submap.model
-    source: dict[str, Any] = {}
-    if context.submap and context.submap.number:
-        source = {"model": identity_of(context.posed / str(model))}
-    elif context.data_format is not None:
-        source = {"source": identity_of(context.source)}
-    yield check_data, "check", {**size, **source}
+        before_submaps = [
+            stage("frames", make_frames, frames=settings.frames.model_dump(), mask=mask),
+            stage("poses", make_poses, diameter=settings.diameter, sfm=settings.sfm.model_dump()),
+        ]
+        return [] if is_scene else before_submaps
+    source: dict[str, object] = {"source": identity_of(context.source)} if is_scene else {}
+    if submap.number:
+        source = {"model": identity_of(context.posed / str(submap.model))}
+    stages = [stage("check", check_data, size=settings.size, **source)]
     if context.estimates_depth:
-        yield estimate_depth, "depth", {**size, "depth": settings.depth.model_dump()}
-    method = method_for(context)
-    load_method(method)  # an unknown method is found out before the work starts
-    yield train, "train", {"method": method, "steps": steps_for(context), "seed": settings.seed}
-    yield evaluate, "evaluate", {}
-    yield mesh, "mesh", {"mesh": settings.mesh.model_dump()}
-    yield coverage, "coverage", {"coverage": settings.coverage.model_dump()}
-    yield show, "scene", {}
-    yield report, "report", {}
+        stages.append(stage("depth", estimate_depth, size=settings.size, depth=settings.depth.model_dump()))
+    load_method(context.method)  # an unknown method is found out before the work starts
+    return [
+        *stages,
+        stage("train", train, method=context.method, steps=steps_for(context), seed=settings.seed),
+        stage("evaluate", evaluate),
+        stage("mesh", mesh, mesh=settings.mesh.model_dump()),
+        stage("coverage", coverage, coverage=settings.coverage.model_dump()),
+        stage("scene", show),
+        stage("report", report),
+    ]
 
 
 def identity_of(path: Path) -> Mapping[str, Any]:
@@ -321,17 +313,9 @@ def estimate_depth(context: StageContext) -> StageRecord:
     from coliags_plugin.reconstruction.depth.scene import DepthRequest, estimate_scene
 
     request = DepthRequest(context.settings.depth)
-    estimated = estimate_scene(
-        context.open_posed(), context.estimated, request, overwrite=True, progress=context.progress
-    )
+    estimated = estimate_scene(context.open_posed(), context.scene, request, overwrite=True, progress=context.progress)
     files = {"depth": "scene in nerfstudio's layout: images, poses, depth, confidence, points"}
     return StageRecord(estimated.summary, files, estimated.warnings)
-
-
-def method_for(context: StageContext) -> str:
-    """Name of the method to train: the one given, or else by what is known of the depth."""
-    chosen = context.settings.method
-    return chosen or ("coliags-in-vivo" if context.estimates_depth or context.has_estimates else "coliags")
 
 
 def steps_for(context: StageContext) -> int:
@@ -356,7 +340,7 @@ def train(context: StageContext) -> StageRecord:
     if not context.estimates_depth:
         options = [*options, *(f"datamanager.{option}" for option in context.model_options)]
     training = TrainOptions(
-        method_for(context),
+        context.method,
         context.scene,
         steps=steps_for(context),
         seed=settings.seed,

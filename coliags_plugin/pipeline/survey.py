@@ -7,16 +7,16 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
+import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, UInt8
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 from typing_extensions import Self
 
-from coliags_plugin.core.arrays import read_arrays
+from coliags_plugin.core.arrays import dilated, read_arrays
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import write_arrays
 from coliags_plugin.core.jobs import Progress
-from coliags_plugin.pipeline.frame_selection import corner_motion, lens_mask, overlays, reduced
 from coliags_plugin.pipeline.frame_sources import FrameSource, watched
 from coliags_plugin.pipeline.settings import FrameSettings
 from coliags_plugin.pipeline.stages import MADE
@@ -29,9 +29,25 @@ log = logging.getLogger(__name__)
 SURVEY_FILE = "survey.npz"
 _ARRAYS = ("sharpness", "followed", "motion")
 #: Brightness of all pixels below which frames show nothing, of 255: that of 12 bits in 16.
-_DARK = 16
+_FAINT = 16
 #: Fewest frames of which something is believed to rest: in a few, moving things are alike by chance.
 _FEWEST_STILL = 10
+#: Larger side of the images that are measured, pixels.
+_SIDE = 480
+#: Corners that are followed, at most, and fewest for a motion.
+_CORNERS, _FEWEST = 200, 12
+#: Width of the surroundings of a corner, which have to be of the lens's image, pixels.
+_RIM = 9
+#: Largest distance between a corner and where following it there and back ends, pixels.
+_RETURN = 0.5
+#: Brightness (of 255) that a pixel outside of the lens's image never exceeds, and pixels by which that is widened.
+_DARK, _MARGIN = 16, 3
+#: Shares of the image between which a dark border is believed.
+_BORDER = (0.002, 0.7)
+#: A pixel that changes by less than this over the video, of 255, is still; the others change by at least twice as much
+#: (median), or the camera rests. Largest share of them, and least gradient of the mean image at an overlay, per pixel:
+#: what moves leaves up to 6.
+_STILL, _OVERLAYS, _EDGE = 48, 0.3, 10.0
 #: Most frames of a video: a day at 60 a second.
 _MOST_FRAMES = 6_000_000
 
@@ -79,6 +95,79 @@ class Survey:
         return cls(**by_frame, size=(height, width), mask=mask if mask.size else None, first=int(arrays["first"]))
 
 
+def lens_mask(brightest: UInt8[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"] | None:
+    """Mask of a lens's image within black surroundings; None where the image has none.
+
+    False where a pixel is dark in every frame and connected to the image's edge. ``brightest`` is the largest value of
+    each pixel in any channel of any frame.
+    """
+    dark = (brightest <= _DARK).astype(np.uint8)
+    _, labels = cv2.connectedComponents(dark)
+    rim = np.unique(np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]]))
+    outside = np.isin(labels, rim[rim > 0]) & (dark > 0)
+    share = float(outside.mean())
+    return ~dilated(outside, _MARGIN) if _BORDER[0] <= share <= _BORDER[1] else None
+
+
+def overlays(
+    darkest: UInt8[np.ndarray, "H W 3"], brightest: UInt8[np.ndarray, "H W 3"], mean: Float32[np.ndarray, "H W 3"]
+) -> Bool[np.ndarray, "H W"]:
+    """Text, logos and frames within the picture: what never changes, with edges, while the rest does.
+
+    True there. ``darkest`` and ``brightest`` are the extremes of each pixel over the frames, ``mean`` its mean.
+    """
+    change = (brightest - darkest).max(axis=2)
+    dark = brightest.max(axis=2) <= _DARK
+    still = (change <= _STILL) & ~dark
+    others = change[~dark & ~still]
+    if not still.any() or still.sum() > _OVERLAYS * (~dark).sum() or np.median(others) < 2 * _STILL:
+        return np.zeros(still.shape, bool)
+    slope = np.zeros(still.shape, np.float32)
+    for number in range(3):  # one channel after the other, for the memory of large frames
+        channel = np.ascontiguousarray(mean[..., number])
+        slopes = (cv2.Sobel(channel, cv2.CV_32F, *axis, scale=1 / 8) for axis in ((1, 0), (0, 1)))
+        np.maximum(slope, np.hypot(*slopes), out=slope)
+    _, labels = cv2.connectedComponents(dilated(still, 1).astype(np.uint8))
+    marked = np.unique(labels[still & dilated(slope > _EDGE, 1)])
+    return dilated(np.isin(labels, marked[marked > 0]), _MARGIN)
+
+
+def reduced(image: UInt8[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "h w"]:
+    """The grey image at the size at which frames are measured."""
+    gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    factor = _SIDE / max(gray.shape)
+    if factor >= 1.0:
+        return gray
+    size = (max(1, round(gray.shape[1] * factor)), max(1, round(gray.shape[0] * factor)))
+    return np.asarray(cv2.resize(gray, size, interpolation=cv2.INTER_AREA))
+
+
+def corner_motion(
+    before: UInt8[np.ndarray, "h w"], after: UInt8[np.ndarray, "h w"], mask: Bool[np.ndarray, "H W"] | None = None
+) -> tuple[float, float]:
+    """Median displacement of corners as a share of the larger side, infinity for too few, and the share followed.
+
+    ``mask``, of the frames before they were reduced, is False where corners do not count, as on text, which rests.
+    """
+    counted = None
+    if mask is not None:
+        counted = cv2.resize(mask.astype(np.uint8), before.shape[::-1], interpolation=cv2.INTER_NEAREST)
+        counted = cv2.erode(counted, np.ones((_RIM, _RIM), np.uint8))
+    # The colon's wall is smooth, and the lamp's brightness changes: local contrast is enhanced.
+    first, second = (cv2.createCLAHE(4.0, (8, 8)).apply(gray) for gray in (before, after))
+    corners = cv2.goodFeaturesToTrack(first, _CORNERS, 0.01, 8, mask=counted)
+    if corners is None or len(corners) < _FEWEST:
+        return float("inf"), 0.0
+    moved, is_tracked, _ = cv2.calcOpticalFlowPyrLK(first, second, corners, None)
+    back, is_tracked_back, _ = cv2.calcOpticalFlowPyrLK(second, first, moved, None)
+    returned = np.linalg.norm(back - corners, axis=2)[:, 0] < _RETURN
+    survived = (is_tracked[:, 0] > 0) & (is_tracked_back[:, 0] > 0) & returned
+    if survived.sum() < _FEWEST:
+        return float("inf"), float(survived.sum()) / _CORNERS
+    lengths = np.linalg.norm(moved - corners, axis=2)[survived, 0]
+    return float(np.median(lengths)) / max(before.shape), float(survived.sum()) / _CORNERS
+
+
 class FrameSurvey:
     """Sharpness of all frames of a video, and the mask that they have in common."""
 
@@ -112,7 +201,7 @@ class FrameSurvey:
         if self._sum is None:
             raise InputError(f"no frames in {self.path}", "a video")
         darkest, brightest = self._extremes
-        if 0 < (top := int(brightest.max())) < _DARK:
+        if 0 < (top := int(brightest.max())) < _FAINT:
             raise InputError(
                 f"no pixel of the {len(self.sharpnesses)} frames of {self.path} is brighter than {top} of 255",
                 "images that use the range of their 8 or 16 bits",

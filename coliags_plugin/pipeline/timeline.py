@@ -14,13 +14,13 @@ import numpy as np
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import read_rgb
-from coliags_plugin.pipeline.contents import Contents, SubmapContents
-from coliags_plugin.pipeline.frame_selection import THINNED
+from coliags_plugin.pipeline.contents import Contents
+from coliags_plugin.pipeline.frames import THINNED
 from coliags_plugin.pipeline.survey import Stretch
-from coliags_plugin.reporting.charts import COLORS
+from coliags_plugin.reporting.html_page import COLORS
 from coliags_plugin.reporting.image_files import EncodedImage
 from coliags_plugin.reporting.model import Template
-from coliags_plugin.reporting.numbers import counted, linear_ticks, tick_label
+from coliags_plugin.reporting.numbers import linear_ticks, tick_label
 
 #: Columns of the ribbon and of the curves, and pictures above it.
 _COLUMNS, _BINS, _PICTURES = 2000, 600, 24
@@ -53,7 +53,7 @@ def frame_states(contents: Contents) -> list[State]:
     Frames that were not used, since of every n only one is, have the state of the used one before them. A frame that
     two sub-maps have posed belongs to the earlier one.
     """
-    video, colors = contents.video, styles(contents)
+    video, colors = contents.video, {submap.name: index % COLORS for index, submap in enumerate(contents.submaps)}
     states: list[State | None] = [None] * video.frames
     for skipped in video.skipped:
         place = slice(skipped.first - video.first, skipped.last + 1 - video.first)
@@ -64,20 +64,13 @@ def frame_states(contents: Contents) -> list[State]:
         of_used |= {frame: State("no pose", why) for frame, why in segment.lost.items() if why != THINNED}
         for submap in segment.submaps:
             of_used |= dict.fromkeys(submap.names, State(submap.name, "", colors[submap.name]))
-        frames = sorted(frame for frame in of_used if span.first <= frame <= span.last) or [span.first]
-        # An earlier segment that shares frames with this one keeps those that it has posed.
-        for frame, start, stop in zip(frames, [span.first, *frames[1:]], [*frames[1:], span.last + 1], strict=True):
-            state = of_used.get(frame, unknown)
-            for index in range(start - video.first, stop - video.first):
-                earlier = states[index]
-                if earlier is None or (earlier.style is None and state.style is not None):
-                    states[index] = state
+        state = of_used.get(min((frame for frame in of_used if frame >= span.first), default=span.first), unknown)
+        for frame in range(span.first, span.last + 1):
+            state, earlier = of_used.get(frame, state), states[frame - video.first]
+            # An earlier segment that shares frames with this one keeps those that it has posed.
+            if earlier is None or (earlier.style is None and state.style is not None):
+                states[frame - video.first] = state
     return [state or State("left out", "in no segment") for state in states]
-
-
-def reasons(states: Sequence[State]) -> Counter[State]:
-    """Number of frames in each state without a pose."""
-    return Counter(state for state in states if state.style is None)
 
 
 def stretches(contents: Contents, states: Sequence[State]) -> Iterator[tuple[Stretch, State]]:
@@ -95,11 +88,6 @@ def _in_columns(states: Sequence[State]) -> list[State]:
         return list(states)
     columns = ([states[index] for index in column] for column in np.array_split(np.arange(len(states)), _COLUMNS))
     return [state for column in columns for state in [Counter(column).most_common(1)[0][0]] * len(column)]
-
-
-def styles(contents: Contents) -> dict[str, int]:
-    """Colour index of each sub-map, by name: neighbours differ."""
-    return {submap.name: index % COLORS for index, submap in enumerate(contents.submaps)}
 
 
 def clock(contents: Contents, frame: float) -> str:
@@ -212,16 +200,3 @@ def _curves(contents: Contents) -> Iterator[dict[str, Any]]:
         lines = (run if len(run) > 1 else 2 * run for run in runs)
         path = "".join("M" + "L".join(f"{x:.1f} {y:.1f}" for x, y in line) for line in lines)
         yield {"title": title, "unit": unit, "top": f"{top:.2g}" if top < 100.0 else "100", "path": path}
-
-
-def why_apart(contents: Contents, states: Sequence[State], submap: SubmapContents, following: SubmapContents) -> str:
-    """Why a sub-map and the one that follows it along the video are not joined, as far as known."""
-    for segment in contents.segments:
-        place = segment.places.get(submap.last)
-        if segment.span.name == submap.segment == following.segment and place is not None and not place.joined:
-            return place.reason
-    first, stop = (frame - contents.video.first for frame in (submap.last + 1, following.first))
-    if first >= stop:
-        return "no frame has a pose in both"
-    why = [f", most: {state.why}" for state, _ in reasons(states[first:stop]).most_common(1)]
-    return f"{counted(stop - first, 'frame')} without a pose in between{''.join(why)}"

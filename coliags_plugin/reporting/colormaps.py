@@ -153,7 +153,7 @@ def color_bar(
 def side_by_side(
     images: Sequence[UInt8[np.ndarray, "H W 3"] | Tensor], labels: Sequence[str]
 ) -> UInt8[np.ndarray, "Hs Ws 3"]:
-    """Images of one height in a row on white, 8 px apart, each under its ASCII label, shortened to its width."""
+    """Images of one height in a row on white, 8 px apart, each under its ASCII label."""
     arrays = [as_array(image) for image in images]
     band, gap, scale = 24, 8, 0.5
     height = band + arrays[0].shape[0]
@@ -163,9 +163,9 @@ def side_by_side(
     for label, array in zip(labels, arrays, strict=True):
         column = sheet[:, x : x + array.shape[1]]
         column[band:] = array
-        # Drawn into a separate strip, so that a label cannot overlap the next one.
+        # Drawn into a separate strip, so that a label ends where the next one begins.
         strip = np.ascontiguousarray(column[:band])
-        draw_text(strip, _shortened(label, array.shape[1] - 4, scale), (2, 16), scale)
+        draw_text(strip, label, (2, 16), scale)
         column[:band] = strip
         x += array.shape[1] + gap
     return sheet
@@ -190,13 +190,6 @@ def hatch(height: int, width: int) -> UInt8[np.ndarray, "H W 3"]:
 def _unit_rgb(values: np.ndarray | Tensor) -> np.ndarray:
     array = as_array(values)
     return array.astype(np.float64) / (255.0 if array.dtype == np.uint8 else 1.0)
-
-
-def _shortened(label: str, width: int, scale: float) -> str:
-    text = label
-    while text and text_width(text, scale) > width:
-        text = text[:-4] + "..." if len(text) > 4 else ""
-    return text
 
 
 def text_width(text: str, scale: float = 0.45) -> int:

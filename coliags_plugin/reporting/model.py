@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
+import math
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from coliags_plugin.reporting.numbers import Direction, column_decimals, number_text, plain, ranks_of, unit_text
+from coliags_plugin.reporting.numbers import (
+    Direction,
+    column_decimals,
+    letters,
+    number_text,
+    plain,
+    ranks_of,
+    unit_text,
+)
 
 if TYPE_CHECKING:
-    from coliags_plugin.reporting.charts import Series
     from coliags_plugin.reporting.colormaps import ColorMap
     from coliags_plugin.reporting.image_files import EncodedImage
 
@@ -19,7 +27,6 @@ Value = str | int | float | None
 
 _LARGEST_MAPPING = 12
 _ABSOLUTE_PATH = re.compile(r"^(/|~|[A-Za-z]:[\\/]|\\\\|file:)")
-_LETTERS = "abcdefghijklmnopqrstuvwxyz"
 
 
 class Block:
@@ -126,7 +133,7 @@ class Table(Block):
                     if cell.note and column.shown is shown:
                         keys.setdefault(cell.note, {})[column.key] = None
         return {
-            text: Footnote(_mark(index), text, tuple(columns)) for index, (text, columns) in enumerate(keys.items())
+            text: Footnote(letters(index), text, tuple(columns)) for index, (text, columns) in enumerate(keys.items())
         }
 
 
@@ -173,6 +180,22 @@ class Image:
     image: EncodedImage  # the file
     caption: str
     wide: bool = False  # whether it takes the page's width, on white
+
+
+@dataclass(frozen=True)
+class Series:
+    """One line of a chart."""
+
+    name: str  # label
+    style: int  # colour index, the same for one method in every chart of a page
+    x: Sequence[float]  # increasing
+    #: same length; values that are not finite (or not positive on a logarithmic axis) interrupt the line
+    y: Sequence[float]
+
+    def points(self, log_y: bool) -> Iterator[tuple[float, float] | None]:
+        """Points of the line; None where one cannot be drawn."""
+        for x, y in zip(self.x, self.y, strict=True):
+            yield (x, y) if math.isfinite(x) and math.isfinite(y) and (y > 0.0 or not log_y) else None
 
 
 @dataclass(frozen=True)
@@ -273,10 +296,11 @@ class Page:
         return [section for section in self.sections if section.blocks and not section.screen_only]
 
 
-def simple_table(head: Sequence[str], rows: Iterable[Sequence[Value | TableCell]]) -> Table:
-    """A table of headings, the first of which is that of the rows' labels, and rows of as many values."""
-    columns = [Column(name, words=not index) for index, name in enumerate(head)]
-    return Table("", columns, [dict(zip(head, row, strict=True)) for row in rows])
+def simple_table(head: Sequence[str | Column], rows: Iterable[Sequence[Value | TableCell]], name: str = "") -> Table:
+    """A table of headings or columns, the first of which is that of the rows' labels, and rows of as many values."""
+    columns = [column if isinstance(column, Column) else Column(column) for column in head]
+    keys = [column.key for column in columns]
+    return Table("", columns, [dict(zip(keys, row, strict=True)) for row in rows], name=name)
 
 
 def ranked_cells(
@@ -330,7 +354,3 @@ def value_text(value: Value) -> str:
     if value is None:
         return ""
     return f"{value:.4g}" if isinstance(value, float) else str(value)
-
-
-def _mark(index: int) -> str:
-    return (_LETTERS[index // 26 - 1] if index >= 26 else "") + _LETTERS[index % 26]

@@ -44,6 +44,11 @@ def counted(number: int, noun: str) -> str:
     return f"{number:,} {noun}{'' if number == 1 else 's'}"
 
 
+def letters(index: int) -> str:
+    """Letters that count: a to z, then aa, ab and so on, for the numbers from 0."""
+    return (chr(ord("a") + index // 26 - 1) if index >= 26 else "") + chr(ord("a") + index % 26)
+
+
 def plain(value: Any) -> str:
     """A JSON value as text: numbers to six digits, long lists abbreviated to their ends, nothing for None."""
     if value is None:

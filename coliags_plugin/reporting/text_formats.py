@@ -284,46 +284,40 @@ def _aligned(rows: Sequence[Sequence[str]], alignment: str) -> str:
     return "\n".join("".join(part.text for part in line).rstrip() for line in console.render_lines(grid, pad=False))
 
 
-class _Values:
-    """JSON values: a method for each kind of block gives the key of the list that its values belong to, and these."""
-
-    def paragraph(self, block: Block) -> None:
-        """Sentences and pictures have no values."""
-
-    bullets = figures = template = paragraph
-
-    def facts(self, block: FactList) -> tuple[str, Any]:
-        return "facts", self.facts_by_name(block.facts)
-
-    def table(self, block: Table) -> tuple[str, Any]:
-        """Columns with their units, and rows of plain values by their keys."""
-        columns = [
-            {"key": column.key, "title": column.name, "unit": column.unit, "better": column.direction}
-            for column in block.columns
-        ]
-        keys = [column.key for column in block.columns]
-        cells = ([cell.text or None if cell.value is None else cell.value for cell in row] for row in block.cells)
-        rows = [dict(zip(keys, row, strict=True)) for row in cells]
-        return "tables", {"title": block.title, "columns": columns, "rows": rows, "notes": list(block.notes)}
-
-    def section(self, block: Section | Folded) -> tuple[str, Any]:
-        values: dict[str, Any] = {"title": block.title}
-        for key, value in filter(None, (getattr(self, inner.kind)(inner) for inner in block.blocks)):
-            values.setdefault(key, []).append(value)
-        return "sections", values
-
-    folded = section
-
-    def facts_by_name(self, facts: Sequence[Fact]) -> dict[str, Any]:
-        return {fact.name: {"value": fact.value, "unit": fact.unit} if fact.unit else fact.value for fact in facts}
-
-
 def page_values(page: Page) -> dict[str, Any]:
     """Facts, cautions and tables of a page as JSON values; no figures and no explaining sentences."""
-    values = _Values()
+    sections = [_section_values(section) for section in page.text_sections]
     return {
         "title": page.title,
-        "facts": values.facts_by_name(page.facts),
+        "facts": _fact_values(page.facts),
         "cautions": list(page.cautions),
-        "sections": [values.section(section)[1] for section in page.text_sections],
+        "sections": sections,
     }
+
+
+def _section_values(section: Section | Folded) -> dict[str, Any]:
+    values: dict[str, Any] = {"title": section.title}
+    for block in section.blocks:
+        if isinstance(block, Section | Folded):
+            values.setdefault("sections", []).append(_section_values(block))
+        elif isinstance(block, Table):
+            values.setdefault("tables", []).append(_table_values(block))
+        elif isinstance(block, FactList):
+            values.setdefault("facts", []).append(_fact_values(block.facts))
+    return values
+
+
+def _table_values(table: Table) -> dict[str, Any]:
+    """Columns with their units, and rows of plain values by their keys."""
+    columns = [
+        {"key": column.key, "title": column.name, "unit": column.unit, "better": column.direction}
+        for column in table.columns
+    ]
+    keys = [column.key for column in table.columns]
+    cells = ([cell.text or None if cell.value is None else cell.value for cell in row] for row in table.cells)
+    rows = [dict(zip(keys, row, strict=True)) for row in cells]
+    return {"title": table.title, "columns": columns, "rows": rows, "notes": list(table.notes)}
+
+
+def _fact_values(facts: Sequence[Fact]) -> dict[str, Any]:
+    return {fact.name: {"value": fact.value, "unit": fact.unit} if fact.unit else fact.value for fact in facts}

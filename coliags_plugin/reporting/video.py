@@ -1,4 +1,4 @@
-"""MP4 video writing with the codecs of PyAV's wheel."""
+"""Writer of MP4 videos."""
 
 from __future__ import annotations
 
@@ -18,17 +18,13 @@ from coliags_plugin.core.files import atomic_path
 from coliags_plugin.reporting.image_files import checked_rgb
 
 if TYPE_CHECKING:
-    from av.container import OutputContainer
     from av.video.stream import VideoStream
     from torch import Tensor
 
 _LOG = logging.getLogger(__name__)
 
-#: With their options, in order of preference: VP9 plays in browsers, MPEG-4 part 2 in players only.
-CODECS = {
-    "libvpx-vp9": {"crf": "15", "b": "0", "deadline": "realtime", "cpu-used": "6"},
-    "mpeg4": {"qmin": "2", "qmax": "4", "b": "50M"},
-}
+#: VP9, which plays in browsers.
+_CODEC, _OPTIONS = "libvpx-vp9", {"crf": "15", "b": "0", "deadline": "realtime", "cpu-used": "6"}
 
 
 def write_video(frames: Iterable[UInt8[np.ndarray, "H W 3"] | Tensor], path: Path, fps: float) -> None:
@@ -64,14 +60,20 @@ def _frame_count(path: Path) -> int:
 
 def _encode(frames: Iterable[np.ndarray | Tensor], scratch: Path, fps: float) -> int:
     shape: tuple[int, ...] = ()
-    count, stream = 0, None
+    count = 0
     # With the protocol, as a colon in the path would name another one.
     with av.open(f"file:{scratch}", "w", "mp4") as file:
+        try:
+            stream = cast("VideoStream", file.add_stream(_CODEC, Fraction(fps).limit_denominator(100_000), _OPTIONS))
+        except av.codec.codec.UnknownCodecError:
+            lacks = f"PyAV {av.__version__} lacks the codec {_CODEC}"
+            raise InputError(lacks, "PyAV's wheel", "Install av from PyPI, or write the frames as PNG") from None
         for frame in frames:
             image = checked_rgb(frame, f"frame {count}")
-            if stream is None:
+            if count == 0:
                 shape = image.shape
-                stream = _stream(file, fps, shape[1] + shape[1] % 2, shape[0] + shape[0] % 2)
+                stream.width, stream.height = shape[1] + shape[1] % 2, shape[0] + shape[0] % 2
+                stream.pix_fmt = "yuv420p"
             elif image.shape != shape:
                 raise InputError(
                     f"frame {count} is {image.shape[1]} x {image.shape[0]} px", f"{shape[1]} x {shape[0]} px as frame 0"
@@ -79,21 +81,6 @@ def _encode(frames: Iterable[np.ndarray | Tensor], scratch: Path, fps: float) ->
             even = np.pad(image, ((0, shape[0] % 2), (0, shape[1] % 2), (0, 0)), mode="edge")
             file.mux(stream.encode(av.VideoFrame.from_ndarray(even, format="rgb24")))
             count += 1
-        if stream is not None:
+        if count:
             file.mux(stream.encode(None))
     return count
-
-
-def _stream(file: OutputContainer, fps: float, width: int, height: int) -> VideoStream:
-    for codec, options in CODECS.items():
-        try:
-            stream = cast("VideoStream", file.add_stream(codec, Fraction(fps).limit_denominator(100_000), options))
-        except av.codec.codec.UnknownCodecError:
-            continue
-        stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
-        return stream
-    raise InputError(
-        f"PyAV {av.__version__} has none of the codecs {', '.join(CODECS)}",
-        "one of them",
-        "Install av from PyPI, or write the frames as PNG",
-    )

@@ -14,7 +14,7 @@ from coliags_plugin.datamanagers.colmap import ATLAS_FILE
 from coliags_plugin.geometry.poses.colmap import write_reconstruction
 from coliags_plugin.phantom.layouts.built_in import SeenPoints, add_points
 from coliags_plugin.pipeline import reconstruct, steps
-from coliags_plugin.pipeline.jobs import StageTask
+from coliags_plugin.pipeline.reconstruct import StageTask
 from coliags_plugin.pipeline.stages import StageRecord
 from coliags_plugin.reporting.video import write_video
 from tests.pipeline.films import film
@@ -59,8 +59,8 @@ def video(tmp_path):
     return tmp_path / "film.mp4"
 
 
-def write_atlas(folder, counts=COUNTS, units=("unknown", "unknown", "unknown"), depth=2.0):
-    """A scene of several models, each with a point before every camera, ``depth`` units away."""
+def write_atlas(folder, counts=COUNTS, units=("unknown", "unknown", "unknown"), listed=True):
+    """A scene of several models, each with a point before every camera, and the ``atlas.json`` that lists them."""
     (folder / "images").mkdir(parents=True)
     start, submaps, names = 0, [], []
     for number, count in enumerate(counts):
@@ -70,7 +70,7 @@ def write_atlas(folder, counts=COUNTS, units=("unknown", "unknown", "unknown"), 
             write_image(folder / "images" / name, frame.image.numpy())
         model = frame_model(frames, own)
         poses = np.stack([frame.camera.camera_to_world.numpy() for frame in frames])
-        points = poses[:, :3, 3] + depth * (number + 1) * poses[:, :3, 2]
+        points = poses[:, :3, 3] + 2.0 * (number + 1) * poses[:, :3, 2]
         seen = [SeenPoints(np.array([[20.0, 16.0]]), np.array([index])) for index in range(count)]
         add_points(model, seen, points, np.zeros((count, 3), np.uint8))
         write_reconstruction(folder / f"sparse/{number}", model)
@@ -79,8 +79,9 @@ def write_atlas(folder, counts=COUNTS, units=("unknown", "unknown", "unknown"), 
         names += own
         start += count
     write_unit(folder, units[0])
-    lost = [{"frame": start, "reason": "blurred"}]
-    write_json(folder / ATLAS_FILE, {"frames": [*names, "lost.png"], "submaps": submaps, "joins": [], "lost": lost})
+    if listed:
+        lost = [{"frame": start, "reason": "blurred"}]
+        write_json(folder / ATLAS_FILE, {"frames": [*names, "lost.png"], "submaps": submaps, "joins": [], "lost": lost})
     return folder
 
 

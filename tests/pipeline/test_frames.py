@@ -18,23 +18,32 @@ import coliags_plugin as cp
 from coliags_plugin.core.arrays import dilated
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import read_alpha, read_rgb, write_image, write_mask
-from coliags_plugin.pipeline.frame_selection import (
+from coliags_plugin.pipeline.frame_sources import (
+    chosen_frames,
+    frame_source,
+    image_files,
+    looks_interlaced,
+    one_field,
+)
+from coliags_plugin.pipeline.frames import (
     EMPTY,
     RESTING,
     THINNED,
     blurred_frames,
+    read_blurred,
+    read_lens_mask,
+    sharpest_frames,
+    write_frames,
+)
+from coliags_plugin.pipeline.settings import FrameSettings
+from coliags_plugin.pipeline.survey import (
+    FrameSurvey,
     corner_motion,
     lens_mask,
-    looks_interlaced,
-    one_field,
     overlays,
     reduced,
-    sharpest_frames,
+    survey_video,
 )
-from coliags_plugin.pipeline.frame_sources import chosen_frames, frame_source, image_files
-from coliags_plugin.pipeline.frames import read_blurred, read_lens_mask, write_frames
-from coliags_plugin.pipeline.settings import FrameSettings
-from coliags_plugin.pipeline.survey import FrameSurvey, survey_video
 from coliags_plugin.reconstruction.structure.point_tracks import sharpness
 from coliags_plugin.reporting.video import write_video
 from tests.pipeline.films import HEIGHT, KNOWN, WIDTH, blurred, film, write_images
@@ -280,7 +289,6 @@ def test_interlaced_frames_are_written_mended_and_the_record_says_it(tmp_path):
     source = chosen_frames(video, FrameSettings())
     summary = write(source, tmp_path / "frames", FrameSettings(least_motion=0.0))
     assert summary.startswith("60 of 60 frames, 160 x 120 px, deinterlaced")
-    assert json.loads((tmp_path / "frames" / "frames.json").read_text())["deinterlaced"]
     with image_files(video) as files:
         for (name, image), file in zip(source, files, strict=True):
             for path in (tmp_path / "frames" / "images" / f"{name}.png", file):

@@ -20,8 +20,7 @@ from coliags_plugin.engine.data_formats import open_scene
 from coliags_plugin.engine.tasks import TaskOutcome
 from coliags_plugin.geometry.poses import colmap, tum
 from coliags_plugin.pipeline import steps
-from coliags_plugin.pipeline.contents import read_contents
-from coliags_plugin.pipeline.export import export_atlas
+from coliags_plugin.pipeline.contents import export_atlas, read_contents
 from coliags_plugin.pipeline.frame_sources import frame_source
 from coliags_plugin.pipeline.joins import PosedFrames, joins
 from coliags_plugin.pipeline.settings import FrameSettings
@@ -143,7 +142,7 @@ def long_video(calls, tmp_path, monkeypatch):
 
     def poses(context):
         calls.append(f"{context.out.name}/make_poses")
-        write_atlas(context.posed)
+        write_atlas(context.posed, listed=False)
         return StageRecord("31 of 50 images posed")
 
     monkeypatch.setattr(steps, "make_poses", poses)
@@ -344,8 +343,8 @@ def test_what_cannot_be_exported_is_refused(out, tmp_path):
         export_atlas(out, export, overwrite=True)
     assert (export / "manifest.json").read_bytes() == before
     for segment in ("segment-000", "segment-001"):
-        (out / segment / "poses" / "atlas.json").write_text("{")
-    with pytest.raises(InputError, match=r"has no sub-map with poses: segment-000: poses/atlas\.json"):
+        (out / segment / "poses" / "atlas.json").unlink()
+    with pytest.raises(InputError, match=r"has no sub-map with poses"):
         export_atlas(out, export, overwrite=True)
 
 

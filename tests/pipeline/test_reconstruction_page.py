@@ -12,7 +12,6 @@ import pytest
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import write_json
-from coliags_plugin.datamanagers.colmap import ATLAS_FILE, read_atlas
 from coliags_plugin.pipeline import page
 from coliags_plugin.pipeline.contents import common_frames, read_contents
 from coliags_plugin.pipeline.page import held_out_text, submap_table, write_page
@@ -53,7 +52,6 @@ def test_sub_maps_have_the_numbers_of_the_video_in_its_order(out):
     }
     assert contents.submaps[4].names[40] == "014.png"
     assert all(submap.stages for submap in contents.submaps)
-    assert list(contents.problems) == []
     assert (len(contents.posed), len(contents.used)) == (57, 58)
 
 
@@ -105,7 +103,7 @@ def test_the_page_tells_what_came_out(out):
     assert f"segment-002/poses failed: {FAILURE}" in text
     assert "the poses of segment-000/0 (well), segment-001/0 (well): there the surface may be bent" in text
     assert "12 frames between them" in text and "washed with water" in text
-    assert text.count("<span>joined</span>") == 1 and text.count("<span>apart</span>") == 5
+    assert text.count("<span>joined</span>") == 1 == text.count("<span>apart</span>")
     assert text.count("<span>A</span>") == 2, "two are in one frame of reference"
     assert "segment-001: frames 26 to 57, 0:02 to 0:05; 31 of 32 used posed; 3 sub-maps" in text
     assert "segment-001/submap-1/check.html" in text
@@ -118,9 +116,6 @@ def test_two_segments_may_be_joined_at_several_models(out):
     change_video(out, joins=[apart, *JOINS])
     text = page_of(out)
     assert "1 of 2 places between segments" in text and "scales differ by 30 %" in text
-    change_video(out, joins=[])
-    assert text.count("no frame has a pose in both") == 4
-    assert page_of(out).count("no frame has a pose in both") == 5
 
 
 @pytest.mark.parametrize(("name", "scenes"), [("long", 4), ("short", 2)])
@@ -149,11 +144,9 @@ def test_the_page_of_a_scene_with_poses_does_without_frames(atlas, tmp_path):
     out = tmp_path / "out"
     record = Record(out, {name: stage for name, stage in three_submaps().items() if name not in ("frames", "poses")})
     record.write()
-    joins = [{"after": 13, "joined": False, "reason": "7 points are seen from both sides"}]
-    write_json(atlas / ATLAS_FILE, read_atlas(atlas).model_dump() | {"joins": joins})
     text = page_of(out, scene=atlas)
     assert "Reconstruction of atlas" in text and "31 of 32 used (97 %)" in text and "blurred" in text
-    assert "7 points are seen from both sides" in text and text.count('class="pictures"') == 1
+    assert text.count('class="pictures"') == 1
     shutil.rmtree(atlas)
     record.stages = {"check": done({"check.html": "check"}, frames=14), "train": done()}
     record.write()
@@ -232,9 +225,9 @@ def test_a_long_video_has_a_time_line_of_bounded_size(out):
     write_json(out / "segment-000" / "poses" / "atlas.json", atlas)
     write_frames(out / "segment-000", used)
     change_video(out, frames=frames, segments=[span("segment-000", 0, frames - 1)], skipped=[], joins=[])
+    (out / "survey.npz").unlink()
     contents = read_contents(out)
     assert len(timeline(contents, frame_states(contents)).values["ribbon"]) <= 2000
-    (out / "survey.npz").unlink()
     text = page_of(out)
     assert len(text) < 1_000_000
     assert "the 200 longest of 4000" in text and "4,000 of 8,000 used (50 %)" in text
@@ -266,38 +259,42 @@ def garble(path):
     path.write_bytes(b'{"frames": [1, ')
 
 
+def first_named(name):
+    def rename(path):
+        content = json.loads(path.read_text())
+        write_json(path, {**content, "frames": [name, *content["frames"][1:]]})
+
+    return rename
+
+
 @pytest.mark.parametrize(
     ("part", "spoil", "message"),
     [
-        ("segment-000/poses/atlas.json", garble, "segment-000: poses/atlas.json"),
+        ("segment-000/poses/atlas.json", garble, "poses/atlas.json"),
+        ("segment-000/poses/atlas.json", first_named("../000.png"), "does not fit the frames: the name '../000.png'"),
+        ("segment-000/poses/atlas.json", first_named("frame_000100.png"), "frame_000100.png is none of the frames"),
         ("segment-000/poses/atlas.json", remove, ""),
-        ("segment-000/frames/frames.json", garble, "segment-000: frames/frames.json"),
+        ("segment-000/frames/frames.json", garble, "frames/frames.json"),
         ("segment-000/frames/frames.json", remove, "poses/atlas.json does not fit the frames: 000.png is none of"),
         ("segment-000/frames/images", remove, ""),
         ("segment-000/run/eval/paper/result.json", garble, ""),
         ("segment-000/run/eval/paper/renders", remove, ""),
         ("segment-000/run/scene.html", remove, ""),
         ("segment-000", remove, ""),
-        ("survey.npz", garble, "cannot read survey.npz"),
+        ("survey.npz", garble, "cannot read .*survey.npz"),
         ("survey.npz", remove, ""),
         ("survey.npz", lambda path: np.savez(path, sharpness=np.zeros(100)), "survey.npz lacks followed"),
         ("survey.npz", lambda path: write_survey(path.parent, 99), "a number for each of 100 frames"),
     ],
 )
-def test_what_is_damaged_or_missing_is_said_and_the_rest_shown(out, part, spoil, message):
+def test_damaged_files_are_refused_and_without_missing_ones_the_rest_is_shown(out, part, spoil, message):
     spoil(out / part)
-    text = page_of(out)
-    assert message in text
-    assert "segment-001/0" in text
-    assert ('class="curve"' in text) == (part != "survey.npz")
-
-
-def test_an_atlas_that_names_frames_elsewhere_is_not_used(out):
-    file = out / "segment-000" / "poses" / "atlas.json"
-    content = json.loads(file.read_text())
-    for name in ("../000.png", "frame_000100.png"):
-        write_json(file, {**content, "frames": [name, *content["frames"][1:]]})
-        assert f"{name}" in read_contents(out).problems[0]
+    if message:
+        with pytest.raises(InputError, match=message):
+            write_page(out)
+    else:
+        text = page_of(out)
+        assert "segment-001/0" in text and ('class="curve"' in text) == (part != "survey.npz")
 
 
 def test_a_video_without_any_pose_has_a_page_that_says_so(tmp_path):

@@ -20,11 +20,11 @@ from coliags_plugin.core.files import write_json
 from coliags_plugin.core.images import write_image
 from coliags_plugin.datamanagers.colmap import ATLAS_FILE, read_atlas
 from coliags_plugin.engine.data_formats import UNKNOWN_MEDIAN_DEPTH
-from coliags_plugin.engine.tasks import TaskOutcome
+from coliags_plugin.engine.tasks import ExecutionOptions, TaskOutcome
 from coliags_plugin.geometry.poses import colmap
 from coliags_plugin.phantom.layouts.built_in import SeenPoints, add_points
 from coliags_plugin.pipeline import stages, steps
-from coliags_plugin.pipeline.jobs import StageJob, StageJobs
+from coliags_plugin.pipeline.reconstruct import StageJob, StageJobs
 from coliags_plugin.pipeline.settings import ReconstructionSettings
 from coliags_plugin.pipeline.stages import (
     LOCK_FILE,
@@ -232,7 +232,7 @@ def test_sub_maps_are_known_once_the_poses_are(calls, video, tmp_path, monkeypat
 
     def poses(context):
         shutil.rmtree(context.posed, ignore_errors=True)
-        write_atlas(context.posed, COUNTS if context.settings.diameter is None else COUNTS[:1])
+        write_atlas(context.posed, COUNTS if context.settings.diameter is None else COUNTS[:1], listed=False)
         return make_poses(context)
 
     monkeypatch.setattr(steps, "make_poses", poses)
@@ -359,7 +359,12 @@ def parts(executor):
 @pytest.mark.thorough
 def test_a_video_by_workers_is_what_one_process_makes(video, tmp_path, workers, calls, monkeypatch):
     make_poses = steps.make_poses
-    monkeypatch.setattr(steps, "make_poses", lambda context: (write_atlas(context.posed), make_poses(context))[1])
+
+    def poses(context):
+        write_atlas(context.posed, listed=False)
+        return make_poses(context)
+
+    monkeypatch.setattr(steps, "make_poses", poses)
     cp.reconstruct(video, tmp_path / "alone")
     alone = list(calls)
     calls.clear()
@@ -389,7 +394,7 @@ def test_a_sub_map_whose_worker_dies_three_times_has_failed_and_the_others_go_on
 def test_the_stage_that_a_worker_is_at_is_told(tmp_path):
     submap, device = Submap(3), torch.device("cpu")
     context = StageContext(tmp_path, tmp_path, ReconstructionSettings(), None, None, device, submap=submap)
-    job = StageJob(StageJobs(Record(tmp_path), [], False, None), context, 27)
+    job = StageJob(StageJobs(Record(tmp_path), [], False, None, ExecutionOptions()), context, 27)
     assert (job.doing, job.progress()) == (f"{tmp_path.name}, sub-map 3", 0)
     worker = Record.of(tmp_path)
     for name in ("check", "depth"):

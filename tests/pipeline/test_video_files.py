@@ -16,8 +16,7 @@ from coliags_plugin.cli.reconstruct import every_of, seconds_of
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import write_image
 from coliags_plugin.geometry.lenses.models import LENSES
-from coliags_plugin.pipeline.frame_selection import one_field
-from coliags_plugin.pipeline.frame_sources import Span, chosen_frames, frame_source, opened_recording
+from coliags_plugin.pipeline.frame_sources import Span, chosen_frames, frame_source, one_field, opened_recording
 from coliags_plugin.pipeline.settings import FrameSettings
 from coliags_plugin.pipeline.survey import Survey, survey_video
 from coliags_plugin.pipeline.video_files import VideoFile

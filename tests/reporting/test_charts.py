@@ -6,10 +6,9 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from coliags_plugin.reporting.charts import Series, style_classes
 from coliags_plugin.reporting.colormaps import color_table
-from coliags_plugin.reporting.html_page import html_blocks
-from coliags_plugin.reporting.model import Chart, ColorBar, Figures
+from coliags_plugin.reporting.html_page import html_blocks, style_classes
+from coliags_plugin.reporting.model import Chart, ColorBar, Figures, Series
 from coliags_plugin.reporting.numbers import linear_ticks, log_ticks, round_up, tick_label
 
 

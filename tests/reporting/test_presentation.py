@@ -14,7 +14,6 @@ from coliags_plugin.comparison.report.report import report_page
 from coliags_plugin.comparison.report.sources import read_study
 from coliags_plugin.config.options import ReportOptions
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.reporting.charts import Series
 from coliags_plugin.reporting.html_page import columns_of, html_blocks, html_text, write_html
 from coliags_plugin.reporting.image_files import EncodedImage
 from coliags_plugin.reporting.model import (
@@ -30,6 +29,7 @@ from coliags_plugin.reporting.model import (
     Page,
     Paragraph,
     Section,
+    Series,
     Table,
     TableCell,
     leaves,

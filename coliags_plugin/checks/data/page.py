@@ -14,7 +14,6 @@ from coliags_plugin.checks.data.hypotheses import LEAST_CONFIDENCE, warp_image
 from coliags_plugin.core.images import sizes_text
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.reporting import model
-from coliags_plugin.reporting.charts import Series
 from coliags_plugin.reporting.colormaps import RGB_ERROR_LIMIT, colorize_depth, colorize_error, rgb_error
 from coliags_plugin.reporting.image_files import EncodedImage, eight_bit
 from coliags_plugin.reporting.numbers import counted, sentence, short_number
@@ -176,12 +175,12 @@ def _trajectory(video: Sequence[Frame], unit: str) -> model.Figures:
     centers = np.stack([frame.camera.center.double().numpy() for frame in video])
     x, y, z = (values.tolist() for values in centers.T)
     frames = [float(frame.index) for frame in video]
-    along = [Series("x", 0, frames, x), Series("y", 1, frames, y), Series("z", 2, frames, z)]
+    along = [model.Series("x", 0, frames, x), model.Series("y", 1, frames, y), model.Series("z", 2, frames, z)]
     position, depth = f"position, {unit}", f"z, {unit}"
     return model.Figures(
         [
             model.Chart(along, "frame", position, "Camera centre along the video", legend=True),
-            model.Chart([Series("path", 3, z, x)], depth, f"x, {unit}", "From above"),
-            model.Chart([Series("path", 3, z, y)], depth, f"y, {unit}", "From the side"),
+            model.Chart([model.Series("path", 3, z, x)], depth, f"x, {unit}", "From above"),
+            model.Chart([model.Series("path", 3, z, y)], depth, f"y, {unit}", "From the side"),
         ]
     )

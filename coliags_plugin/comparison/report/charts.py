@@ -11,8 +11,7 @@ import numpy as np
 
 from coliags_plugin.comparison.report.study import Study, TestSet, grouped
 from coliags_plugin.engine.run_folder import RunFolder
-from coliags_plugin.reporting.charts import Series
-from coliags_plugin.reporting.model import Chart, Figures, Folded, Paragraph, Section, Template
+from coliags_plugin.reporting.model import Chart, Figures, Folded, Paragraph, Section, Series, Template
 from coliags_plugin.results.comparisons import common_scenes
 from coliags_plugin.results.record import ProfileRecord
 
