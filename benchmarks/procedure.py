@@ -48,7 +48,7 @@ from coliags_plugin.pipeline.joins import ModelKey, SegmentJoin
 from coliags_plugin.pipeline.stages import Record
 from coliags_plugin.reporting.video import write_video
 from coliags_plugin.surface.coverage.measure import PartialCoverage, measure_coverage
-from coliags_plugin.surface.coverage.visibility import CoverageView, Level
+from coliags_plugin.surface.coverage.visibility import CoverageSettings, CoverageView, Level
 
 #: Of each phantom: seeds count from here; lengths of the withdrawals, mm; frames, and frames between two phantoms.
 SEED, LENGTHS, FRAMES, BETWEEN = 4100, (60, 45, 55, 35, 60, 50, 40, 60), 700, 50
@@ -390,9 +390,8 @@ class Truth:
             return row
         lens = PinholeLens.of(read_intrinsics(self._folders[most] / "camera.json"))
         wall = _wall(self._folders[most] / "truth" / "mesh.ply")
-        of_wall = measure_coverage(
-            wall, [CoverageView(str(number), self._poses[number], lens) for number in model.frames]
-        )
+        views = [CoverageView(str(number), self._poses[number], lens) for number in model.frames]
+        of_wall = measure_coverage(wall, views, CoverageSettings())
         seen = of_wall.views.seen[: len(wall)]  # guessed wall is behind it
         mesh = read_mesh(run / "mesh" / "mesh.ply")
         mesh = replace(mesh, vertices=fit.points(mesh.vertices))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
@@ -97,7 +97,7 @@ class WallCoverage(SeenWall):
     clock: Float[np.ndarray, "F"]  # clock angle of each triangle, degrees
     section: LumenSection  # what part of the lumen is measured
     grid: TubeGrid  # the wall, guessed or not, around the centreline
-    regions: list[MissedRegion]  # of the section, the largest first
+    regions: Sequence[MissedRegion] = ()  # of the section, the largest first
 
     @property
     def inside(self) -> Bool[np.ndarray, "F"]:
@@ -106,10 +106,7 @@ class WallCoverage(SeenWall):
 
 
 def measure_coverage(
-    mesh: TriangleMesh,
-    views: Sequence[CoverageView],
-    settings: CoverageSettings | None = None,
-    metric: bool = True,
+    mesh: TriangleMesh, views: Sequence[CoverageView], settings: CoverageSettings, metric: bool = True
 ) -> WallCoverage | PartialCoverage:
     """Measure what a recording shows of the wall of a lumen, in the world frame and mm, and what it misses.
 
@@ -117,7 +114,6 @@ def measure_coverage(
     can be called unseen; guessed wall always is. Without a lumen, or in a unit that is not mm (``metric``), what was
     seen of the mesh is measured alone, then without the limits in mm.
     """
-    settings = settings or CoverageSettings()
     if not metric:
         settings = settings.model_copy(update={"max_distance": np.inf, "far": np.inf})
     mesh = facing_cameras(mesh, views, settings)
@@ -138,67 +134,44 @@ def _along_lumen(
     """Coverage of the section of a lumen that was seen, its wall completed by a guess."""
     line = find_centreline(mesh, [view.camera_to_world for view in views])
     guess = guessed_wall(wall_around(mesh, line))
-    whole, guessed = _joined(mesh, guess)
-    whole_views = _extended(face_views, len(guess))
+    vertices = np.concatenate([mesh.vertices, guess.vertices.astype(mesh.vertices.dtype)])
+    whole = TriangleMesh(vertices, np.concatenate([mesh.triangles, guess.triangles + len(mesh.vertices)]))
+    guessed = np.arange(len(whole)) >= len(mesh)
+    unseen = vars(FaceViews.unseen(len(guess)))
+    whole_views = FaceViews(**{name: np.concatenate([seen, unseen[name]]) for name, seen in vars(face_views).items()})
     level = classify(whole_views, settings)
     arc, clock, _ = line.unroll(whole.centers)
     # Beyond the ends of the centreline nothing was guessed, so that the share of wall seen there says nothing.
     along = (arc >= line.arc[0]) & (arc <= line.arc[-1])
     section = find_section(arc[along], whole.areas[along], whole_views.seen[along])
-    grid = wall_around(whole, line)
-    missed = (level == Level.UNSEEN) & section.holds(arc)
-    pairs = np.concatenate(
-        [neighbours(whole), near_pairs(whole.centers, missed & guessed, missed & ~guessed, _TOUCHING)]
-    )
-    regions = [
-        _described(triangles, whole, guessed, line, arc, section, views)
-        for triangles in large_regions(missed, pairs, whole.areas, settings.region_area)
-    ]
     names = [view.name for view in views]
-    return WallCoverage(
-        whole, guessed, whole_views, level, names, settings, True, line, arc, clock, section, grid, regions
+    wall = WallCoverage(
+        whole, guessed, whole_views, level, names, settings, True, line, arc, clock, section, wall_around(whole, line)
     )
+    missed = (level == Level.UNSEEN) & wall.inside
+    touching = near_pairs(whole.centers, missed & guessed, missed & ~guessed, _TOUCHING)
+    pairs = np.concatenate([neighbours(whole), touching])
+    regions = large_regions(missed, pairs, whole.areas, settings.region_area)
+    return replace(wall, regions=[_described(triangles, wall, views) for triangles in regions])
 
 
-def _joined(mesh: TriangleMesh, guess: TriangleMesh) -> tuple[TriangleMesh, Bool[np.ndarray, "F"]]:
-    """Join two meshes, without colours; returns which triangles are the second's too."""
-    vertices = np.concatenate([mesh.vertices, guess.vertices.astype(mesh.vertices.dtype)])
-    triangles = np.concatenate([mesh.triangles, guess.triangles + len(mesh.vertices)])
-    return TriangleMesh(vertices, triangles), np.arange(len(triangles)) >= len(mesh)
-
-
-def _extended(views: FaceViews, more: int) -> FaceViews:
-    """Views of the triangles, with unseen ones behind."""
-    unseen = {"best_frame": -1, "frames": 0, "clear_frames": 0, "good_frames": 0}
-    added = {name: np.full(more, unseen.get(name, np.nan), array.dtype) for name, array in vars(views).items()}
-    return FaceViews(**{name: np.concatenate([array, added[name]]) for name, array in vars(views).items()})
-
-
-def _described(
-    triangles: Int[np.ndarray, "K"],
-    mesh: TriangleMesh,
-    guessed: Bool[np.ndarray, "F"],
-    line: Centreline,
-    arc: Float[np.ndarray, "F"],
-    section: LumenSection,
-    views: Sequence[CoverageView],
-) -> MissedRegion:
-    areas, centers = mesh.areas[triangles], mesh.centers[triangles]
+def _described(triangles: Int[np.ndarray, "K"], wall: WallCoverage, views: Sequence[CoverageView]) -> MissedRegion:
+    areas, centers = wall.mesh.areas[triangles], wall.mesh.centers[triangles]
     area = float(areas.sum())
     centroid = (centers * areas[:, None]).sum(axis=0) / area
     # On the wall, not inside the lumen, where the centroid of a ring would be.
     middle = centers[np.argmin(np.linalg.norm(centers - centroid, axis=1))]
-    position, clock, _ = line.unroll(middle[None])
-    start, end = float(arc[triangles].min()), float(arc[triangles].max())
+    position, clock, _ = wall.line.unroll(middle[None])
+    start, end = float(wall.arc[triangles].min()), float(wall.arc[triangles].max())
     return MissedRegion(
         triangles,
         area,
-        float(areas[guessed[triangles]].sum()),
+        float(areas[wall.guessed[triangles]].sum()),
         middle,
         float(position[0]),
         float(clock[0]),
         (start, end),
-        start < section.start + STEP or end > section.end - STEP,
+        start < wall.section.start + STEP or end > wall.section.end - STEP,
         _nearest_view(centers[:: max(1, len(centers) // _SAMPLES)], views),
     )
 

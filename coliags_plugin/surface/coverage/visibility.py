@@ -9,7 +9,6 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
-from functools import cached_property
 
 import cv2
 import numpy as np
@@ -91,33 +90,23 @@ class RayGrid:
         directions = np.full((len(pixels), 3), np.nan)
         directions[inside] = lens.unproject(pixels[inside])
         cells = np.flatnonzero(np.isfinite(directions).all(axis=1))
-        directions = directions[cells]
-        angles = _pixel_angles(lens, pixels[cells], directions)
+        directions, pixels = directions[cells], pixels[cells]
+        # From directions half a pixel aside; 0 where the lens ends there.
+        right, down = (lens.unproject(pixels + aside) - lens.unproject(pixels - aside) for aside in 0.5 * np.eye(2))
+        area = np.abs(right[:, 0] * down[:, 1] - right[:, 1] * down[:, 0])
+        angles = np.nan_to_num(area / np.linalg.norm(directions, axis=1) ** 3)
         return cls((width, height), cells, directions.astype(np.float32), angles.astype(np.float32))
-
-    def world_rays(self, view: CoverageView) -> Float32[np.ndarray, "R 3"]:
-        """The directions in the world of a view's pose. [R, 3]"""
-        return np.einsum("nc,dc->nd", self.directions, view.camera_to_world[:3, :3].astype(np.float32))
-
-    @cached_property
-    def narrowest_cosine(self) -> float:
-        """Cosine of the widest angle of a ray to the optical axis."""
-        return float(1.0 / np.linalg.norm(self.directions, axis=1).max()) if len(self.cells) else 1.0
-
-    @cached_property
-    def _ray_of_cell(self) -> Int[np.ndarray, "G"]:
-        rays = np.full(self.size[0] * self.size[1], -1)
-        rays[self.cells] = np.arange(len(self.cells))
-        return rays
 
     def nearest(self, lens: Lens, pixels: Float[np.ndarray, "N 2"]) -> Int[np.ndarray, "N"]:
         """The ray nearest to each pixel of the lens; -1 outside the image and its content. [N]"""
         width, height = self.size
+        ray_of_cell = np.full(width * height, -1)
+        ray_of_cell[self.cells] = np.arange(len(self.cells))
         with np.errstate(invalid="ignore"):
             cell = pixels * (width / lens.width, height / lens.height)
             inside = np.all((cell >= 0.0) & (cell < (width, height)), axis=1)
         column, row = np.where(inside[:, None], cell, 0.0).astype(int).T
-        return np.asarray(np.where(inside, self._ray_of_cell[row * width + column], -1))
+        return np.asarray(np.where(inside, ray_of_cell[row * width + column], -1))
 
     def brightness(self, image: UInt8[np.ndarray, "H W 3"]) -> Float32[np.ndarray, "R"]:
         """Grey value of the image, 0 to 1, along each ray. [R]"""
@@ -126,16 +115,6 @@ class RayGrid:
         smaller = width < grey.shape[1]
         grey = cv2.resize(grey, (width, height), interpolation=cv2.INTER_AREA if smaller else cv2.INTER_NEAREST)
         return np.asarray(grey.reshape(-1)[self.cells].astype(np.float32) / np.float32(255.0))
-
-
-def _pixel_angles(
-    lens: Lens, pixels: Float[np.ndarray, "R 2"], directions: Float[np.ndarray, "R 3"]
-) -> Float[np.ndarray, "R"]:
-    """Solid angles of pixels, from directions half a pixel aside; 0 where the lens ends there. [R]"""
-    right, down = (lens.unproject(pixels + aside) - lens.unproject(pixels - aside) for aside in 0.5 * np.eye(2))
-    area = np.abs(right[:, 0] * down[:, 1] - right[:, 1] * down[:, 0])
-    angles = area / np.linalg.norm(directions, axis=1) ** 3
-    return np.asarray(np.nan_to_num(angles))
 
 
 def recorded_views(scene: Scene) -> list[CoverageView]:
@@ -169,26 +148,6 @@ def _view(frame: Frame) -> CoverageView:
 _PROBE_FRAMES, _PROBE_RAYS = 8, 20_000
 
 
-@dataclass(frozen=True, eq=False)
-class FaceViews:
-    """Counts and extremes over the frames that saw each triangle of a mesh. All [F]."""
-
-    frames: Int[np.ndarray, "F"]  # number of frames that saw it at all
-    clear_frames: Int[np.ndarray, "F"]  # those that saw it near enough and bright enough
-    good_frames: Int[np.ndarray, "F"]  # those of the latter that saw it under a steep enough angle
-    # Smallest distance to a camera that saw it, mm; NaN where unseen, here and below.
-    distance: Float32[np.ndarray, "F"]
-    incidence: Float32[np.ndarray, "F"]  # smallest angle between viewing ray and normal, degrees
-    pixels_per_length: Float32[np.ndarray, "F"]  # finest sampling of the surface by an image, pixels per mm
-    brightness: Float32[np.ndarray, "F"]  # highest grey value, 0 to 1; NaN also without images
-    best_frame: Int[np.ndarray, "F"]  # index of the frame that sampled it most finely; -1 where unseen
-
-    @property
-    def seen(self) -> Bool[np.ndarray, "F"]:
-        """Mask of triangles that a frame saw. [F]"""
-        return np.asarray(self.frames > 0)
-
-
 @dataclass(frozen=True)
 class RayHits:
     """Rays of one frame that hit a triangle within the range. All [N]."""
@@ -199,11 +158,65 @@ class RayHits:
     cosine: Float32[np.ndarray, "N"]  # of the angle between ray and normal, 1 where perpendicular to the surface
 
 
+@dataclass(frozen=True, eq=False)
+class FaceViews:
+    """Counts and extremes over the frames that saw each triangle of a mesh. All [F]."""
+
+    frames: Int[np.ndarray, "F"]  # number of frames that saw it at all
+    clear_frames: Int[np.ndarray, "F"]  # those that saw it near enough and bright enough
+    good_frames: Int[np.ndarray, "F"]  # those of the latter that saw it under a steep enough angle
+    # Smallest distance to a camera that saw it, mm; NaN where unseen, here and below.
+    distance: Float32[np.ndarray, "F"]
+    cosine: Float32[np.ndarray, "F"]  # of the smallest angle between viewing ray and normal
+    pixels_per_length: Float32[np.ndarray, "F"]  # finest sampling of the surface by an image, pixels per mm
+    brightness: Float32[np.ndarray, "F"]  # highest grey value, 0 to 1; NaN also without images
+    best_frame: Int[np.ndarray, "F"]  # index of the frame that sampled it most finely; -1 where unseen
+
+    @classmethod
+    def unseen(cls, faces: int) -> FaceViews:
+        """The views of triangles before any frame."""
+        frames, clear, good = np.zeros((3, faces), np.int32)
+        distance, cosine, fineness, brightness = np.full((4, faces), np.nan, np.float32)
+        best = np.full(faces, -1, np.int32)
+        return cls(frames, clear, good, distance, cosine, fineness, brightness, best)
+
+    @property
+    def seen(self) -> Bool[np.ndarray, "F"]:
+        """Mask of triangles that a frame saw. [F]"""
+        return np.asarray(self.frames > 0)
+
+    @property
+    def incidence(self) -> Float32[np.ndarray, "F"]:
+        """Smallest angle between viewing ray and normal, degrees. [F]"""
+        return np.asarray(np.degrees(np.arccos(np.clip(self.cosine, -1.0, 1.0))))
+
+    def add(self, number: int, hits: RayHits, grid: RayGrid, view: CoverageView, settings: CoverageSettings) -> None:
+        """Count a frame by the triangles that it hits."""
+        face = hits.triangle
+        clear = hits.distance <= settings.far
+        if view.read_image is not None and len(face):
+            brightness = grid.brightness(view.read_image())[hits.ray]
+            clear &= brightness >= settings.dark
+            np.fmax.at(self.brightness, face, brightness)
+        good = clear & (hits.cosine >= np.cos(np.radians(settings.grazing)))
+        self.frames[np.unique(face)] += 1
+        self.clear_frames[np.unique(face[clear])] += 1
+        self.good_frames[np.unique(face[good])] += 1
+        np.fmin.at(self.distance, face, hits.distance)
+        np.fmax.at(self.cosine, face, hits.cosine)
+        # A pixel covers solid angle * distance^2 / cosine of the surface.
+        patch = grid.pixel_angles[hits.ray] * hits.distance**2
+        before = np.nan_to_num(self.pixels_per_length, nan=-1.0)
+        fineness = np.sqrt(hits.cosine / np.maximum(patch, np.finfo(np.float32).tiny))
+        np.fmax.at(self.pixels_per_length, face, fineness)
+        self.best_frame[self.pixels_per_length > before] = number
+
+
 def view_hits(
     mesh: TriangleMesh, view: CoverageView, grid: RayGrid, max_depth: float, both_sides: bool = False
 ) -> RayHits:
     """First hits of the rays of a view, up to a z-depth in mm, from the front; or, cosines below 0, from behind."""
-    rays = grid.world_rays(view)
+    rays = np.einsum("nc,dc->nd", grid.directions, view.camera_to_world[:3, :3].astype(np.float32))
     triangle, z_depth = mesh.rays.cast(view.center, rays)
     hit = np.flatnonzero((triangle >= 0) & (z_depth <= max_depth))
     length = np.linalg.norm(grid.directions[hit], axis=1)
@@ -222,7 +235,8 @@ def _visible_centroids(
     distance = np.linalg.norm(offset, axis=1)
     normals = mesh.normals[triangles].astype(np.float32)
     cosine = -np.einsum("nc,nc->n", offset, normals) / np.maximum(distance, 1e-9)
-    ahead = (local[:, 2] > grid.narrowest_cosine * distance) & (local[:, 2] <= max_depth) & (cosine > 0.0)
+    narrowest = float(1.0 / np.linalg.norm(grid.directions, axis=1).max(initial=1.0))  # cosine to the optical axis
+    ahead = (local[:, 2] > narrowest * distance) & (local[:, 2] <= max_depth) & (cosine > 0.0)
     visible = np.flatnonzero(ahead)
     rays = grid.nearest(view.lens, view.lens.project(local[visible]))
     visible, rays = visible[rays >= 0], rays[rays >= 0]
@@ -235,7 +249,8 @@ def facing_cameras(mesh: TriangleMesh, views: Sequence[CoverageView], settings: 
     """The mesh, its triangles counter-clockwise from the side of the cameras, as most rays of a few frames see it."""
     if not views:
         raise InputError("a recording without frames", "one frame or more")
-    _check_not_empty(mesh)
+    if not len(mesh):
+        raise InputError("a mesh without triangles", "the surface that the camera filmed")
     probes = views[:: max(1, len(views) // _PROBE_FRAMES)]
     hits = [
         view_hits(mesh, view, grid, settings.max_distance, both_sides=True)
@@ -260,76 +275,26 @@ def see_faces(mesh: TriangleMesh, views: Sequence[CoverageView], settings: Cover
     ``settings.max_distance``. Of triangles that no ray of any frame hits, because they lie between the rays, those
     whose centroid is in view count as seen.
     """
-    _check_not_empty(mesh)
-    tally = _Tally(len(mesh))
+    face_views = FaceViews.unseen(len(mesh))
     with ProgressReport("cast viewing rays", len(views)) as progress:
         for number, (view, grid) in enumerate(_with_grids(views, settings.rays)):
-            tally.add(number, view_hits(mesh, view, grid, settings.max_distance), grid, view, settings)
+            face_views.add(number, view_hits(mesh, view, grid, settings.max_distance), grid, view, settings)
             progress.update(number + 1)
-    between = np.flatnonzero(tally.counts[0] == 0)
+    between = np.flatnonzero(face_views.frames == 0)
     for number, (view, grid) in enumerate(_with_grids(views, settings.rays)):
         hits = _visible_centroids(mesh, view, grid, between, settings.max_distance)
-        tally.add(number, hits, grid, view, settings)
-    return tally.result()
-
-
-def _check_not_empty(mesh: TriangleMesh) -> None:
-    if not len(mesh):
-        raise InputError("a mesh without triangles", "the surface that the camera filmed")
+        face_views.add(number, hits, grid, view, settings)
+    return face_views
 
 
 def _with_grids(views: Sequence[CoverageView], most: int) -> Iterator[tuple[CoverageView, RayGrid]]:
     """Views with the ray grids of their lenses and masks, made anew only where lens or mask change."""
-    last: CoverageView | None = None
+    last = None
     for view in views:
-        if last is None or last.lens != view.lens or not _same(last.mask, view.mask):
-            grid = RayGrid.of(view.lens, view.mask, most)
-        last = view
+        behind = view.lens, None if view.mask is None else view.mask.tobytes()
+        if behind != last:
+            grid, last = RayGrid.of(view.lens, view.mask, most), behind
         yield view, grid
-
-
-def _same(first: Bool[np.ndarray, "H W"] | None, second: Bool[np.ndarray, "H W"] | None) -> bool:
-    return first is second or (first is not None and second is not None and np.array_equal(first, second))
-
-
-class _Tally:
-    """Counts and extremes over frames, of each triangle."""
-
-    def __init__(self, faces: int) -> None:
-        self.counts = np.zeros((3, faces), np.int32)
-        self.distance = np.full(faces, np.inf, np.float32)
-        self.cosine, self.fineness, self.brightness = np.full((3, faces), -1.0, np.float32)
-        self.best = np.full(faces, -1, np.int32)
-
-    def add(self, number: int, hits: RayHits, grid: RayGrid, view: CoverageView, settings: CoverageSettings) -> None:
-        face = hits.triangle
-        if not len(face):
-            return
-        clear = hits.distance <= settings.far
-        if view.read_image is not None:
-            brightness = grid.brightness(view.read_image())[hits.ray]
-            clear &= brightness >= settings.dark
-            np.maximum.at(self.brightness, face, brightness)
-        good = clear & (hits.cosine >= np.cos(np.radians(settings.grazing)))
-        for count, chosen in zip(self.counts, (face, face[clear], face[good]), strict=True):
-            count[np.unique(chosen)] += 1
-        np.minimum.at(self.distance, face, hits.distance)
-        np.maximum.at(self.cosine, face, hits.cosine)
-        # A pixel covers solid angle * distance^2 / cosine of the surface.
-        patch = grid.pixel_angles[hits.ray] * hits.distance**2
-        before = self.fineness.copy()
-        np.maximum.at(self.fineness, face, np.sqrt(hits.cosine / np.maximum(patch, np.finfo(np.float32).tiny)))
-        self.best[self.fineness > before] = number
-
-    def result(self) -> FaceViews:
-        frames, clear, good = self.counts
-        incidence = np.degrees(np.arccos(np.clip(self.cosine, -1.0, 1.0)))
-        distance, incidence, fineness = (
-            np.where(frames > 0, values, np.nan).astype(np.float32)
-            for values in (self.distance, incidence, self.fineness)
-        )
-        brightness = np.where(self.brightness >= 0.0, self.brightness, np.nan).astype(np.float32)
-        return FaceViews(frames, clear, good, distance, incidence, fineness, brightness, self.best)
 
 
 class Level(IntEnum):

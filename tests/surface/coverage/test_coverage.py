@@ -33,7 +33,6 @@ from coliags_plugin.surface.coverage.measure import (
     near_pairs,
     neighbours,
 )
-from coliags_plugin.surface.coverage.page import RESEARCH_USE, draw_map, draw_partial
 from coliags_plugin.surface.coverage.visibility import (
     CoverageSettings,
     Level,
@@ -43,7 +42,13 @@ from coliags_plugin.surface.coverage.visibility import (
     recorded_views,
     see_faces,
 )
-from coliags_plugin.surface.coverage.writing import measure_scene, open_recording
+from coliags_plugin.surface.coverage.writing import (
+    RESEARCH_USE,
+    draw_map,
+    draw_partial,
+    measure_scene,
+    open_recording,
+)
 from tests.commands import refused, run
 from tests.surface.coverage.tubes import grid_mesh, joined, pinhole, plane, sphere, tube, view_at
 
@@ -147,7 +152,7 @@ def test_input_that_cannot_be_measured_is_refused():
     with pytest.raises(InputError, match="without frames"):
         facing_cameras(mesh, [], DEFAULTS)
     with pytest.raises(InputError, match="without triangles"):
-        see_faces(mesh.part(np.zeros(len(mesh), bool)), [view_at((0, 0, 0))], DEFAULTS)
+        facing_cameras(mesh.part(np.zeros(len(mesh), bool)), [view_at((0, 0, 0))], DEFAULTS)
     with pytest.raises(InputError, match=r"setting far: .*got -3\.0"):
         validated(CoverageSettings, {"far": -3.0}, "setting")
 
