@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -29,16 +28,23 @@ from coliags_plugin.geometry.meshes.truth import (
 )
 from coliags_plugin.reporting.image_files import write_png
 from coliags_plugin.reporting.model import Block, Paragraph, simple_table
-from coliags_plugin.surface.meshing.colors import best_colors, best_texture
 from coliags_plugin.surface.meshing.mending import close_holes, smoothed
 from coliags_plugin.surface.meshing.pictures import comparison_picture, distance_colors
-from coliags_plugin.surface.meshing.views import DepthView, MeshSettings, max_depth_of, rendered_depth, voxel_size_of
+from coliags_plugin.surface.meshing.views import (
+    DepthView,
+    MeshSettings,
+    best_colors,
+    best_texture,
+    max_depth_of,
+    rendered_depth,
+    voxel_size_of,
+)
 from coliags_plugin.surface.meshing.volume import Volume
 
 
 @dataclass(frozen=True, eq=False)
 class FusedRun:
-    """Mesh fused from the depth of a run, the number of holes closed in it, and its texture."""
+    """Mesh fused from the depth of a run."""
 
     mesh: TriangleMesh
     holes: int  # that were closed
@@ -91,7 +97,7 @@ class MeshedRun:
 def mesh_run(
     trained: TrainedRun,
     output: Path,
-    settings: MeshSettings | None = None,
+    settings: MeshSettings,
     formats: Sequence[str] = MESH_FORMATS,
     truth: Path | None = None,
     overwrite: bool = False,
@@ -103,7 +109,6 @@ def mesh_run(
     the world of the scene and mm, or the folder of a scene with one; None: that of the run's scene, where there is one.
     """
     scene = trained.scene
-    settings = settings or MeshSettings()
     with atomic_folder(output, overwrite) as folder:
         surface = _true_surface(scene, truth)
         fused = fuse_run(trained, settings)
@@ -113,7 +118,26 @@ def mesh_run(
             write_mesh(folder / f"mesh.{name}", mesh, fused.texture)
         if surface is not None:
             _write_comparison(folder, mesh, surface, scene)
-        write_json(folder / "mesh.json", _summary(trained, fused, settings, surface, compared))
+        reach = max_depth_of(settings, scene)
+        used = {"voxel_size": voxel_size_of(settings, scene), "max_depth": reach if np.isfinite(reach) else None}
+        summary = {
+            "format": FORMAT,
+            "method": trained.method,
+            "scene": scene.name,
+            "step": trained.step,
+            "views": len(scene.train),
+            "unit": scene.provenance.unit,
+            "settings": settings.model_dump() | used,
+            "vertices": len(mesh.vertices),
+            "triangles": len(mesh),
+            "holes_closed": fused.holes,
+            "texture": None if fused.texture is None else fused.texture.image.shape[0],
+            "area": float(mesh.areas.sum()),
+            "bounds": [mesh.vertices.min(axis=0).tolist(), mesh.vertices.max(axis=0).tolist()],
+            "truth": None if surface is None else portable_name(surface.path.resolve(), scene.folder or Path()),
+            "comparison": None if compared is None else compared.as_json(),
+        }
+        write_json(folder / "mesh.json", summary)
     return MeshedRun(output, mesh, compared)
 
 
@@ -121,7 +145,15 @@ def _true_surface(scene: Scene, truth: Path | None) -> TrueSurface | None:
     path = truth or (None if scene.folder is None else find_true_surface(scene.folder))
     if path is None or (truth is None and not scene.is_metric):
         return None
-    unit = "mm" if scene.is_metric else _same_world(scene, path).length_unit
+    unit = "mm"
+    if not scene.is_metric:  # a scene of the same poses shares its scale
+        if not path.is_dir():
+            raise InputError(
+                f"scene '{scene.name}' is of unknown scale, {path} in mm",
+                "the folder of a scene with the same poses, and with a true surface",
+                "Pass `truth=SCENE`, or give the scene its scale first (docs/poses.md)",
+            )
+        unit = match_truth(scene, open_scene(path)).scene.length_unit
     surface = replace(read_true_surface(path), unit=unit)
     if surface.seen_by:
         return surface
@@ -145,17 +177,6 @@ def first_hits(mesh: TriangleMesh, frames: Sequence[Frame]) -> Bool[np.ndarray, 
     return first
 
 
-def _same_world(scene: Scene, truth: Path) -> Scene:
-    """Accept the truth of a scene with the same poses for one of unknown scale, which then shares its scale."""
-    if not truth.is_dir():
-        raise InputError(
-            f"scene '{scene.name}' is of unknown scale, {truth} in mm",
-            "the folder of a scene with the same poses, and with a true surface",
-            "Pass `truth=SCENE`, or give the scene its scale first (docs/poses.md)",
-        )
-    return match_truth(scene, open_scene(truth)).scene
-
-
 def _write_comparison(folder: Path, mesh: TriangleMesh, truth: TrueSurface, scene: Scene) -> None:
     frames = scene.train
     cameras = [frames[index].camera for index in sorted({0, len(frames) // 2, len(frames) - 1})]
@@ -166,35 +187,6 @@ def _write_comparison(folder: Path, mesh: TriangleMesh, truth: TrueSurface, scen
     shown[truth.mesh.triangles[truth.seen]] = True
     gaps = distance_colors(mesh.rays.nearest(truth.mesh.vertices)[0], shown)
     write_mesh(folder / "truth_error.ply", replace(truth.mesh, colors=gaps))
-
-
-def _summary(
-    trained: TrainedRun,
-    fused: FusedRun,
-    settings: MeshSettings,
-    truth: TrueSurface | None,
-    compared: SurfaceComparison | None,
-) -> dict[str, Any]:
-    """Contents of mesh.json."""
-    scene, mesh, reach = trained.scene, fused.mesh, max_depth_of(settings, trained.scene)
-    used = {"voxel_size": voxel_size_of(settings, scene), "max_depth": reach if np.isfinite(reach) else None}
-    return {
-        "format": FORMAT,
-        "method": trained.method,
-        "scene": scene.name,
-        "step": trained.step,
-        "views": len(scene.train),
-        "unit": scene.provenance.unit,
-        "settings": settings.model_dump() | used,
-        "vertices": len(mesh.vertices),
-        "triangles": len(mesh),
-        "holes_closed": fused.holes,
-        "texture": None if fused.texture is None else fused.texture.image.shape[0],
-        "area": float(mesh.areas.sum()),
-        "bounds": [mesh.vertices.min(axis=0).tolist(), mesh.vertices.max(axis=0).tolist()],
-        "truth": None if truth is None else portable_name(truth.path.resolve(), scene.folder or Path()),
-        "comparison": None if compared is None else compared.as_json(),
-    }
 
 
 def comparison_blocks(compared: SurfaceComparison) -> list[Block]:

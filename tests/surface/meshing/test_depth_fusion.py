@@ -18,10 +18,10 @@ from coliags_plugin.core.scenes import PointCloud
 from coliags_plugin.geometry.meshes.mesh import TriangleMesh, read_mesh, write_mesh
 from coliags_plugin.reporting.text_formats import terminal_text
 from coliags_plugin.surface.meshing import views
-from coliags_plugin.surface.meshing.colors import best_texture
 from coliags_plugin.surface.meshing.fusion import comparison_blocks, first_hits, fuse_run, mesh_run
 from coliags_plugin.surface.meshing.views import (
     MeshSettings,
+    best_texture,
     incidence_cosines,
     max_depth_of,
     rendered_depth,
