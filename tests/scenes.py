@@ -16,7 +16,7 @@ from coliags_plugin.core.provenance import Provenance
 from coliags_plugin.core.scene_files import write_camera_json
 from coliags_plugin.core.scenes import Frame, PointCloud, Scene
 from coliags_plugin.geometry.poses.c3vd import matrix_lines
-from coliags_plugin.phantom.layouts.built_in import depth_steps
+from coliags_plugin.phantom.layouts import depth_steps
 
 
 def camera_at(x: float, y: float, z: float, width: int = 32, height: int = 24, yaw: float = 0.0) -> Camera:

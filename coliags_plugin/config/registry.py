@@ -263,10 +263,10 @@ _BUILT_INS: dict[tuple[str, str], dict[str, object]] = {
         "tum": "coliags_plugin.geometry.poses.tum:FORMAT",
     },
     ("phantom_layouts", "phantom layout"): {
-        "c3vd": "coliags_plugin.phantom.layouts.built_in:C3VDLayout",
-        "colmap": "coliags_plugin.phantom.layouts.built_in:ColmapLayout",
-        "nerfstudio": "coliags_plugin.phantom.layouts.built_in:NerfstudioLayout",
-        "rgbd": "coliags_plugin.phantom.layouts.built_in:RGBDLayout",
+        "c3vd": "coliags_plugin.phantom.layouts:C3VDLayout",
+        "colmap": "coliags_plugin.phantom.layouts:ColmapLayout",
+        "nerfstudio": "coliags_plugin.phantom.layouts:NerfstudioLayout",
+        "rgbd": "coliags_plugin.phantom.layouts:RGBDLayout",
     },
 }
 #: All kinds by their names.

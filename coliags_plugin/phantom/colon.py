@@ -8,6 +8,7 @@ about every 25 mm. Lengths are mm, angles radians.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
@@ -15,6 +16,7 @@ from jaxtyping import Float, Int
 
 from coliags_plugin.phantom.settings import PhantomSettings
 from coliags_plugin.phantom.streams import Purpose, SolidNoise, smoothstep, stream
+from coliags_plugin.phantom.tracing import Tracer
 
 #: Length of the segment, mm.
 LENGTH = 232.0
@@ -128,21 +130,15 @@ class Anatomy:
     taenia_twist: float
     swell_phase: float
 
-    def taenia_distance(
-        self, arc: Float[np.ndarray, "S 1"], clock: Float[np.ndarray, "1 C"]
-    ) -> Float[np.ndarray, "3 S C"]:
-        """Clock angle to each of the three taeniae, radians."""
-        rotated = clock - self.taenia_clock - self.taenia_twist * arc
-        return _wrapped(rotated[None] - _TAENIAE[:, None, None])
-
     def radius(self, arc: Float[np.ndarray, "S"], clock: Float[np.ndarray, "C"]) -> Float[np.ndarray, "S C"]:
         """Distance of the wall from the centre line, mm."""
         arc, clock = arc[:, None], clock[None, :]
         # Narrower beyond the bend (and so never wider than the bend's radius of curvature).
         calibre = RADIUS * (1.0 + 0.05 * np.sin(2.0 * np.pi * arc / 90.0 + self.swell_phase))
         calibre *= 1.0 - 0.15 * smoothstep((arc - 110.0) / 50.0)
-        bands = np.exp(-0.5 * (self.taenia_distance(arc, clock) / 0.2) ** 2).sum(axis=0)
-        lobes = np.cos(3.0 * (clock - self.taenia_clock - self.taenia_twist * arc))
+        twisted = clock - self.taenia_clock - self.taenia_twist * arc
+        bands = np.exp(-0.5 * (_wrapped(twisted[None] - _TAENIAE[:, None, None]) / 0.2) ** 2).sum(axis=0)
+        lobes = np.cos(3.0 * twisted)
         wall = calibre * (1.0 - 0.055 * lobes - 0.04 * bands)
         # A fourth-power sum keeps crossing crescents from piling up, and is smooth.
         rise = np.zeros_like(wall)
@@ -186,17 +182,15 @@ def grow_anatomy(settings: PhantomSettings) -> Anatomy:
                 )
             )
         station += generator.normal(settings.fold_spacing, 0.12 * settings.fold_spacing)
-    polyps = tuple(_draw_polyp(generator, stations) for _ in range(settings.polyps))
-    return Anatomy(centre_line, tuple(folds), polyps, taenia_clock, twist, swell)
-
-
-def _draw_polyp(generator: np.random.Generator, stations: list[float]) -> Polyp:
-    """Sample a polyp between two folds, on the part of the wall that the camera looks at."""
+    # Between two folds, on the part of the wall that the camera looks at.
     between = [0.5 * (a + b) for a, b in pairwise(stations)]
     places = [arc for arc in between if 30.0 < arc < 125.0]
-    arc = float(generator.choice(places)) + generator.uniform(-4.0, 4.0)
-    width = generator.uniform(3.0, 10.0)
-    return Polyp(arc, generator.uniform(0.0, 2.0 * np.pi), width, width * generator.uniform(0.33, 0.39))
+    polyps = []
+    for _ in range(settings.polyps):
+        arc = float(generator.choice(places)) + generator.uniform(-4.0, 4.0)
+        width = generator.uniform(3.0, 10.0)
+        polyps.append(Polyp(arc, generator.uniform(0.0, 2.0 * np.pi), width, width * generator.uniform(0.33, 0.39)))
+    return Anatomy(centre_line, tuple(folds), tuple(polyps), taenia_clock, twist, swell)
 
 
 @dataclass(frozen=True)
@@ -220,6 +214,11 @@ class ColonSurface:
     def rows(self) -> int:
         """Number of rows."""
         return len(self.arc)
+
+    @cached_property
+    def tracer(self) -> Tracer:
+        """Casts rays at the wall; made once."""
+        return Tracer(self.vertices, self.triangles)
 
     def grid_coordinates(
         self, triangle: Int[np.ndarray, "N"], barycentric: Float[np.ndarray, "N 2"]

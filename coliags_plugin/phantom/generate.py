@@ -18,22 +18,32 @@ from scipy.spatial.transform import Rotation
 from coliags_plugin.config.registry import phantom_layouts
 from coliags_plugin.core import __version__
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.files import atomic_folder, write_arrays, write_json
+from coliags_plugin.core.files import atomic_folder, reporting_unwritable, write_arrays, write_json
 from coliags_plugin.core.images import write_image
 from coliags_plugin.core.jobs import Progress
 from coliags_plugin.core.ply import point_properties, write_ply
 from coliags_plugin.geometry.poses.alignment import umeyama
 from coliags_plugin.geometry.poses.trajectory import rigid
 from coliags_plugin.phantom.colon import ColonSurface, WallMotion, build_surface, frame_times, grow_anatomy, wall_motion
-from coliags_plugin.phantom.imaging import Exposure, Sensor, World, expose, meter
-from coliags_plugin.phantom.layouts.base import Layout, Part, PhantomFrame, WallPoints
+from coliags_plugin.phantom.imaging import (
+    KNEE,
+    Exposure,
+    Sensor,
+    World,
+    develop,
+    expose,
+    exposure_for,
+    exposures,
+    meter_weights,
+    white_balances,
+)
+from coliags_plugin.phantom.layouts import Layout, Part, PhantomFrame, WallPoints
 from coliags_plugin.phantom.light import CameraLight, IndirectLight, indirect_lights
 from coliags_plugin.phantom.mucosa import Mucosa, paint_mucosa
 from coliags_plugin.phantom.props import bodies_at, wet_lens
-from coliags_plugin.phantom.response import KNEE, develop, exposure_for, exposures, meter_weights, white_balances
 from coliags_plugin.phantom.settings import SAME_COLORS, PhantomSettings
 from coliags_plugin.phantom.streams import Purpose, slow_drift, stream
-from coliags_plugin.phantom.tracing import Tracer, nearest_poses_first, seen_from
+from coliags_plugin.phantom.tracing import nearest_poses_first, seen_from
 from coliags_plugin.phantom.trajectory import RotationView, camera_path, poses_during, turn_away
 
 _LOG = logging.getLogger(__name__)
@@ -93,49 +103,43 @@ class PreparedPhantom:
             return z_depth
         return estimated_depth(z_depth, self.settings, number)
 
+    def world_at(self, number: int) -> World:
+        """The world as it is in image ``number``."""
+        frame = self.frames[number]
+        surface = self.world.surface if self.motion is None else self.motion.at(frame)
+        bodies = bodies_at(surface, self.settings, frame / self.settings.frame_rate)
+        return replace(self.world, surface=surface, indirect=self.indirect[number], bodies=bodies)
+
     def render_frame(self, number: int) -> tuple[Exposure, UInt8[np.ndarray, "P 3"]]:
         """Render image ``number``."""
-        frame, settings, sensor = self.frames[number], self.settings, self.sensor
+        settings, sensor = self.settings, self.sensor
         during: list[Float[np.ndarray, "4 4"]] = []
         if settings.shutter and number < settings.frames:
-            least = sensor.samples.shape[1]
-            sequence = self.poses[: settings.frames]
-            during = poses_during(sequence, number, settings.shutter, sensor.focal_length, least)
-        world = world_at(self.world, self.motion, settings, frame)
-        exposure = expose(world, sensor, self.poses[number], self.indirect[number], during)
+            focal_length = float(1.0 / np.sqrt(sensor.pixel_angle))
+            sequence, least = self.poses[: settings.frames], sensor.samples.shape[1]
+            during = poses_during(sequence, number, settings.shutter, focal_length, least)
+        exposure = expose(self.world_at(number), sensor, self.poses[number], during)
         if settings.washes:
-            radiance, cover = wet_lens(
-                sensor.image(exposure.radiance), sensor.image(exposure.cover), settings, frame / settings.frame_rate
-            )
+            time = self.frames[number] / settings.frame_rate
+            radiance, cover = wet_lens(sensor.image(exposure.radiance), sensor.image(exposure.cover), settings, time)
             exposure = replace(exposure, radiance=radiance[sensor.mask], cover=cover[sensor.mask])
         if settings.softness:
             exposure = replace(exposure, radiance=sensor.softened(exposure.radiance, settings.softness))
         noise = stream(settings.seed, Purpose.SENSOR, number)
         return exposure, develop(exposure.radiance, self.gains[number], settings, noise, sensor)
 
-    def wall(
-        self, exposure: Exposure, pose: Float[np.ndarray, "4 4"], pixels: Int[np.ndarray, "N"]
-    ) -> Float[np.ndarray, "N 3"]:
-        """Wall points of lit pixels, world frame; if the wall moves, where they are at rest."""
+    def wall(self, exposure: Exposure, number: int, pixels: Int[np.ndarray, "N"]) -> Float[np.ndarray, "N 3"]:
+        """Wall points of lit pixels of image ``number``, world frame; if the wall moves, where they are at rest."""
         if self.motion is not None:
-            at_rest = self.world.tracer.interpolate(self.motion.rest.vertices, exposure.hits.only(pixels))
+            rest = self.world.surface
+            at_rest = rest.tracer.interpolate(rest.vertices, exposure.hits.only(pixels))
             return np.asarray(at_rest, np.float64)
-        local = self.sensor.centers[pixels] * exposure.z_depth[pixels, None]
+        local, pose = self.sensor.centers[pixels] * exposure.z_depth[pixels, None], self.poses[number]
         return np.asarray(local.astype(np.float64) @ pose[:3, :3].T + pose[:3, 3])
 
     def seen(self, points: Float[np.ndarray, "N 3"], cameras: list[Float[np.ndarray, "4 4"]]) -> Bool[np.ndarray, "N"]:
         """Return which points of the wall are seen from at least one of these poses."""
-        return seen_from(points, cameras, self.sensor.lens, self.sensor.mask, self.world.tracer)
-
-
-def world_at(world: World, motion: WallMotion | None, settings: PhantomSettings, frame: int) -> World:
-    """The world at a frame, from that of the wall at rest."""
-    if motion is not None:
-        surface = motion.at(frame)
-        world = replace(world, surface=surface, tracer=Tracer(surface))
-    if settings.covers:
-        world = replace(world, bodies=bodies_at(world.surface, settings, frame / settings.frame_rate))
-    return world
+        return seen_from(points, cameras, self.sensor.lens, self.sensor.mask, self.world.surface.tracer)
 
 
 def resolve(settings: PhantomSettings, layout: Layout) -> PhantomSettings:
@@ -156,50 +160,61 @@ def prepare(settings: PhantomSettings, report: Progress) -> PreparedPhantom:
     report("colon", 1, 4)
     mucosa = paint_mucosa(anatomy, surface, settings)
     report("colon", 2, 4)
-    tracer = Tracer(surface)
     lamps = CameraLight.all_of(settings)
-    world = World(surface, mucosa, tracer, lamps, settings.light_preset.vignetting)
     motion = wall_motion(anatomy, surface, settings)
-    sequence = camera_path(anatomy.centre_line, settings, tracer, motion)
-    views = turn_away(sequence, settings, layout.is_test) if layout.has_rotation else []
+    sequence = camera_path(anatomy.centre_line, settings, surface.tracer, motion)
+    training = [frame for frame in range(settings.frames) if not layout.is_test(frame)]
+    views = turn_away(sequence, settings, training)
     poses = np.stack([*sequence, *(view.camera_to_world for view in views)])
-    frames = [*range(settings.frames), *(view.frame for view in views)]
     indirect: list[IndirectLight | None] = [None] * len(poses)
     if settings.interreflection > 0.0:
         generator = stream(settings.seed, Purpose.INTERREFLECTION)
         albedo = vertex_albedo(surface, mucosa)
-        indirect[:] = indirect_lights(surface, albedo, tracer, lamps, list(poses), settings.interreflection, generator)
+        indirect[:] = indirect_lights(surface, albedo, lamps, poses, settings.interreflection, generator)
     report("colon", 3, 4)
     lens, mask = layout.lens(settings.width or 0, settings.height or 0)
-    sensor = Sensor.behind(lens, mask, settings.supersampling)
-    thin = sensor.subsampled(_METERED)
-    weights = meter_weights(thin.mask, settings)
+    phantom = PreparedPhantom(
+        settings,
+        layout,
+        World(surface, mucosa, lamps, settings.light_preset.vignetting),
+        Sensor.behind(lens, mask, settings.supersampling),
+        views,
+        poses,
+        [*range(settings.frames), *(view.frame for view in views)],
+        indirect,
+        np.ones((len(poses), 3)),
+        motion,
+    )
+    phantom = replace(phantom, gains=_gains(phantom, report))
+    report("colon", 4, 4)
+    return phantom
+
+
+def _gains(phantom: PreparedPhantom, report: Progress) -> Float[np.ndarray, "N 3"]:
+    """Red, green and blue gain of every image, by metering; refuses a wall that moves over the camera."""
+    settings, frames = phantom.settings, phantom.frames
+    thin = phantom.sensor.subsampled(_METERED)
+    weights, spacing = meter_weights(thin.mask, settings), float(np.sqrt(thin.pixel_angle))
     is_metered = settings.rotation_exposure == "metered"
     ideal = []
-    for number, frame in enumerate(frames if is_metered else frames[: settings.frames]):
-        now = world_at(world, motion, settings, frame)
-        if motion is not None and number < settings.frames:
-            _check_clear(now, poses[number], frame)
-        ideal.append(exposure_for(meter(now, thin, poses[number], indirect[number]), settings, weights))
+    for number in range(len(frames) if is_metered else settings.frames):
+        world, pose = phantom.world_at(number), phantom.poses[number]
+        if phantom.motion is not None and number < settings.frames:
+            nearest = float(world.surface.tracer.clearance(pose[None, :3, 3])[0])
+            if nearest < _CLEAR:
+                raise InputError(
+                    f"the wall moves to {nearest:.1f} mm from the camera at frame {number}",
+                    f"at least {_CLEAR:g} mm",
+                    "Choose a smaller wave or breathing, or another seed",
+                )
+        radiance, _, _ = world.look(pose, thin.centers, spacing)
+        ideal.append(exposure_for(radiance, settings, weights))
         if settings.moves:
             report("exposure", min(number + 1, settings.frames), settings.frames)
     during, settled = ideal[: settings.frames], ideal[settings.frames :]
     levels = exposures(during, settings)
     rotated = exposures(during, settings, settled) if is_metered else levels[frames[settings.frames :]]
-    gains = np.concatenate([levels, rotated])[:, None] * white_balances(settings)[frames]
-    report("colon", 4, 4)
-    return PreparedPhantom(settings, layout, world, sensor, views, poses, frames, indirect, gains, motion)
-
-
-def _check_clear(world: World, pose: Float[np.ndarray, "4 4"], frame: int) -> None:
-    """Refuse a wall that has moved over the camera."""
-    nearest = float(world.tracer.clearance(pose[None, :3, 3])[0])
-    if nearest < _CLEAR:
-        raise InputError(
-            f"the wall moves to {nearest:.1f} mm from the camera at frame {frame}",
-            f"at least {_CLEAR:g} mm",
-            "Choose a smaller wave or breathing, or another seed",
-        )
+    return np.concatenate([levels, rotated])[:, None] * white_balances(settings)[frames]
 
 
 def generate(
@@ -212,14 +227,10 @@ def generate(
     seen masks of the sequence's test frames; and ``phantom.json``. The same settings give the same bytes.
     """
     report = progress or (lambda stage, done, total: None)
-    try:
-        with atomic_folder(output, overwrite) as folder:
-            phantom = prepare(settings, report)
-            _write(phantom, folder, report)
-            write_json(folder / "phantom.json", {"version": __version__, "settings": phantom.settings.model_dump()})
-    except OSError as error:
-        reason = error.strerror or str(error)
-        raise InputError(f"cannot write to {output}: {reason}", "a writable folder", "Choose another output") from error
+    with reporting_unwritable(output), atomic_folder(output, overwrite) as folder:
+        phantom = prepare(settings, report)
+        _write(phantom, folder, report)
+        write_json(folder / "phantom.json", {"version": __version__, "settings": phantom.settings.model_dump()})
     _LOG.info("phantom of seed %d written to %s", settings.seed, output)
 
 
@@ -239,7 +250,7 @@ def _write(phantom: PreparedPhantom, folder: Path, report: Progress) -> None:
         z_depth = phantom.given_depth(image(exposure.z_depth), number)
         layout.write_frame(folder, PhantomFrame(part, index, image(color), z_depth))
         if phantom.motion is not None and part == "video":
-            fits.append(_to_rest(phantom, exposure, phantom.poses[number]))
+            fits.append(_to_rest(phantom, exposure, number))
         if phantom.settings.covers and part == "video":
             write_image(folder / "truth" / "not_wall" / f"{index:04d}.png", image(exposure.cover))
         if part == "video":
@@ -249,7 +260,7 @@ def _write(phantom: PreparedPhantom, folder: Path, report: Progress) -> None:
             if layout.has_points:
                 drawn.append(_draw_points(phantom, index, exposure, color))
         else:
-            mask = image(_seen_mask(phantom, exposure, phantom.poses[number]))
+            mask = image(_seen_mask(phantom, exposure, number))
             write_image(layout.seen_mask(folder, part, index), mask)
         report("frames", number + 1, total)
     poses = phantom.given_poses
@@ -278,14 +289,12 @@ def _rendered_frames(phantom: PreparedPhantom, total: int) -> Iterator[tuple[Exp
             yield ready
 
 
-def _seen_mask(
-    phantom: PreparedPhantom, exposure: Exposure, camera_to_world: Float[np.ndarray, "4 4"]
-) -> UInt8[np.ndarray, "P"]:
+def _seen_mask(phantom: PreparedPhantom, exposure: Exposure, number: int) -> UInt8[np.ndarray, "P"]:
     """Seen mask: 255 where a training frame sees the pixel's surface point, else 0."""
     hit = np.flatnonzero(exposure.z_depth > 0.0)
-    points = phantom.wall(exposure, camera_to_world, hit)
+    points = phantom.wall(exposure, number, hit)
     mask = np.zeros(len(exposure.z_depth), np.uint8)
-    order = nearest_poses_first(camera_to_world, phantom.training_poses)
+    order = nearest_poses_first(phantom.poses[number], phantom.training_poses)
     mask[hit] = np.where(phantom.seen(points, order), 255, 0)
     return mask
 
@@ -298,7 +307,7 @@ def _draw_points(
     share = min(-(-_POINTS // len(phantom.training_poses)), len(hit))
     generator = stream(phantom.settings.seed, Purpose.POINTS, index)
     chosen = np.sort(generator.choice(hit, share, replace=False))
-    return phantom.wall(exposure, phantom.poses[index], chosen), color[chosen]
+    return phantom.wall(exposure, index, chosen), color[chosen]
 
 
 def _write_truth(
@@ -340,14 +349,12 @@ def _write_truth(
     write_json(folder / "light.json", light)
 
 
-def _to_rest(
-    phantom: PreparedPhantom, exposure: Exposure, pose: Float[np.ndarray, "4 4"]
-) -> tuple[Float[np.ndarray, "4 4"], float]:
+def _to_rest(phantom: PreparedPhantom, exposure: Exposure, number: int) -> tuple[Float[np.ndarray, "4 4"], float]:
     """The pose relative to the wall in view as it is at rest, by the best rigid fit, and its residual (RMS), mm."""
     hit = np.flatnonzero(exposure.z_depth > 0.0)
-    hit = hit[:: max(len(hit) // _FITTED, 1)]
+    hit, pose = hit[:: max(len(hit) // _FITTED, 1)], phantom.poses[number]
     moved = exposure.z_depth[hit, None].astype(np.float64) * phantom.sensor.centers[hit] @ pose[:3, :3].T + pose[:3, 3]
-    at_rest = phantom.wall(exposure, pose, hit)
+    at_rest = phantom.wall(exposure, number, hit)
     fit = umeyama(moved, at_rest)
     relative = pose.copy()
     relative[:3, :3], relative[:3, 3] = fit.rotation @ pose[:3, :3], fit.points(pose[None, :3, 3])[0]

@@ -11,7 +11,7 @@ which lights all that the lens sees. A lamp beside the lens casts shadows.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -51,18 +51,18 @@ class CameraLight:
         tilt = np.radians(preset.tilt)
         offsets = settings.lamps or (settings.light_offset or (0.0, 0.0, 0.0),)
         shares = settings.lamp_shares or (1.0,) * len(offsets)
-        lamp = cls(
-            offset=offsets[0],
-            axis=(0.0, float(np.sin(tilt)), float(np.cos(tilt))),
-            spread_law=preset.spread_law,
-            spread=preset.spread,
-            specular=settings.specular,
-            roughness=settings.roughness,
-            f0=F0,
-            diffuse_roughness=settings.diffuse_roughness,
-        )
         return tuple(
-            replace(lamp, offset=offset, share=share / sum(shares))
+            cls(
+                offset=offset,
+                axis=(0.0, float(np.sin(tilt)), float(np.cos(tilt))),
+                spread_law=preset.spread_law,
+                spread=preset.spread,
+                specular=settings.specular,
+                roughness=settings.roughness,
+                f0=F0,
+                diffuse_roughness=settings.diffuse_roughness,
+                share=share / sum(shares),
+            )
             for offset, share in zip(offsets, shares, strict=True)
         )
 
@@ -255,15 +255,14 @@ def solve(
 def indirect_lights(
     surface: ColonSurface,
     vertex_albedo: Float[np.ndarray, "V 3"],
-    tracer: Tracer,
     lamps: Sequence[CameraLight],
-    cameras_to_world: Sequence[Float[np.ndarray, "4 4"]],
+    cameras_to_world: Float[np.ndarray, "T 4 4"],
     share: float,
     generator: np.random.Generator,
 ) -> list[IndirectLight]:
     """Indirect light for every camera pose, times a factor ``share``."""
     patches = make_patches(surface, vertex_albedo, generator)
-    factors = form_factors(patches, tracer)
+    factors = form_factors(patches, surface.tracer)
     flat_points, flat_normals = patches.points.reshape(-1, 3), patches.normals.reshape(-1, 3)
     direct = np.zeros((len(patches.areas), len(cameras_to_world)))
     for index, camera_to_world in enumerate(cameras_to_world):
@@ -273,7 +272,7 @@ def indirect_lights(
             # Visibility is from the lens even if the lamp is behind it: see light.py on rings of light guides.
             source = lamp.position(camera_to_world) if lamp.casts_shadows else camera_to_world[:3, 3]
             lit = np.flatnonzero(received > 0.0)
-            received[lit] *= tracer.visible(flat_points[lit], source)
+            received[lit] *= surface.tracer.visible(flat_points[lit], source)
             direct[:, index] += received.reshape(-1, _SAMPLES).mean(axis=1)
     solved = share * solve(patches, factors, direct)
     rows, columns = patches.shape

@@ -13,7 +13,6 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from coliags_plugin.geometry.meshes.mesh import TriangleMesh
 from coliags_plugin.phantom.colon import ColonSurface, around_the_colon, grid_triangles, unit
 from coliags_plugin.phantom.light import CameraLight
 from coliags_plugin.phantom.settings import PhantomSettings
@@ -119,7 +118,7 @@ def bodies_at(surface: ColonSurface, settings: PhantomSettings, time: float) -> 
     for is_there, cover, make in makers:
         if is_there:
             vertices, normals, triangles = make(surface, settings, time)
-            tracer = Tracer(TriangleMesh(vertices.astype(np.float32), triangles))
+            tracer = Tracer(vertices.astype(np.float32), triangles)
             bodies.append(Body(cover, tracer, normals.astype(np.float32)))
     return tuple(bodies)
 

@@ -1,4 +1,4 @@
-"""Ray casting against the colon's mesh, and what of the wall cameras see."""
+"""Ray casting against meshes of the colon, and what of the wall cameras see."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from jaxtyping import Bool, Float, Int
 
 from coliags_plugin.geometry.lenses.models import Lens
 from coliags_plugin.geometry.meshes.mesh import TriangleMesh
-from coliags_plugin.phantom.colon import ColonSurface
 
 
 @dataclass(frozen=True)
@@ -35,9 +34,9 @@ def rotated(vectors: Float[np.ndarray, "N 3"], rotation: Float[np.ndarray, "3 3"
 class Tracer:
     """Ray-casting scene of a mesh: the wall, or a body over it."""
 
-    def __init__(self, surface: ColonSurface | TriangleMesh) -> None:
-        self._triangles = surface.triangles
-        self._rays = TriangleMesh(surface.vertices, surface.triangles).rays
+    def __init__(self, vertices: Float[np.ndarray, "V 3"], triangles: Int[np.ndarray, "F 3"]) -> None:
+        self._triangles = triangles
+        self._rays = TriangleMesh(vertices, triangles).rays
 
     def cast(self, camera_to_world: Float[np.ndarray, "4 4"], directions: Float[np.ndarray, "N 3"]) -> Hits:
         """First hits of rays from a camera; directions in its axes, z = 1, so that a hit's parameter is its z-depth."""

@@ -8,8 +8,9 @@ and forth with fast turns and wall contacts, are per second: more frames show mo
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import scipy.ndimage
@@ -82,16 +83,17 @@ def rotation_about(axis: Float[np.ndarray, "3"], angle: float) -> Float[np.ndarr
 
 
 def square_to(clock: float) -> Float[np.ndarray, "3"]:
-    """Axis about which a camera turns towards a clock angle around its optical axis, radians."""
+    """Axis about which a camera turns towards a clock angle, radians, around its optical axis."""
     return np.array([-np.sin(clock), np.cos(clock), 0.0])
 
 
-def _farthest(is_clear: Callable[[float], bool], most: float, steps: int) -> float:
-    """Largest clear amount, up to ``most``, by so many bisections."""
-    low, high = 0.0, most
+def _farthest(is_clear: Callable[[Any], Any], most: Any, steps: int) -> Any:
+    """Largest clear amount up to ``most``, a number or an array of them, by so many bisections."""
+    low, high = np.zeros_like(most), most
     for _ in range(steps):
         middle = 0.5 * (low + high)
-        low, high = (middle, high) if is_clear(middle) else (low, middle)
+        clear = is_clear(middle)
+        low, high = np.where(clear, middle, low), np.where(clear, high, middle)
     return low
 
 
@@ -214,7 +216,7 @@ def _choose_spots(withdrawal: _Withdrawal, tracer: Tracer, seed: int, generator:
         for draw in range(_DRAWS):
             # More and more of the circumference is tried.
             tried = clock + generator.uniform(-1.0, 1.0) * min(0.3 + 0.1 * draw, np.pi)
-            turn = _turn(np.radians(generator.uniform(*_SPOT_ANGLE)), tried)
+            turn = np.radians(generator.uniform(*_SPOT_ANGLE)) * square_to(tried)
             spot = _approach(withdrawal, number, turn, tracer)
             if spot is not None:
                 break
@@ -253,8 +255,8 @@ def _far_turn(
     """Rotation vector of a far stop: the one nearest to its neighbours' of those whose wall is about 60 mm away."""
     (point,), (frame,) = withdrawal.at(np.array([time]))
     clocks = np.arange(24) * (np.pi / 12.0)
-    turns = np.array([_turn(angle, clock) for angle in np.radians(_FAR_ANGLES) for clock in clocks])
-    around = [_turn(angle, clock) for angle in np.radians(_MIDDLE) for clock in clocks[::3]]
+    turns = np.array([angle * square_to(clock) for angle in np.radians(_FAR_ANGLES) for clock in clocks])
+    around = [angle * square_to(clock) for angle in np.radians(_MIDDLE) for clock in clocks[::3]]
     rays = _matrices(np.array([np.zeros(3), *around]))[:, :, 2]
     directions = np.einsum("tij,rj->tri", _matrices(turns), rays)
     distances = _distances(point, frame, directions.reshape(-1, 3), tracer).reshape(len(turns), -1)
@@ -274,11 +276,6 @@ def _distances(
     directions = directions / directions[:, 2:]
     depth = tracer.cast(pose, directions.astype(np.float32)).z_depth
     return np.asarray(depth * np.linalg.norm(directions, axis=1))
-
-
-def _turn(angle: float, clock: float) -> Float[np.ndarray, "3"]:
-    """Rotation vector that turns the third axis by an angle towards a clock angle around it, radians."""
-    return angle * square_to(clock)
 
 
 def _matrices(turns: Float[np.ndarray, "... 3"]) -> Float[np.ndarray, "... 3 3"]:
@@ -345,11 +342,7 @@ def _permitted(
 ) -> Float[np.ndarray, "T"]:
     """Share of the sideways motion that keeps the camera off the wall, smooth in time."""
     nearest = _CLEAR_OF_WALL + settings.wave + settings.breathing
-    low, high = np.zeros(len(points)), np.ones(len(points))
-    for _ in range(12):
-        middle = 0.5 * (low + high)
-        clear = clearance(points + middle[:, None] * sideways) > nearest
-        low, high = np.where(clear, middle, low), np.where(clear, high, middle)
+    low = _farthest(lambda share: clearance(points + share[:, None] * sideways) > nearest, np.ones(len(points)), 12)
     width = max(round(0.4 * settings.frame_rate), 1)
     return np.asarray(scipy.ndimage.gaussian_filter1d(scipy.ndimage.minimum_filter1d(low, 2 * width + 1), 0.5 * width))
 
@@ -381,8 +374,6 @@ def _reach(
     return _farthest(is_clear, 30.0, 16) * swing
 
 
-#: Interval of held-out test frames.
-TEST_EVERY = 8
 #: Travel of the ``rotation`` trajectory, mm.
 _ROTATION_TRAVEL = 6.0
 #: How far ahead on the centre line the camera looks, mm.
@@ -413,7 +404,7 @@ def camera_path(
             centre_line,
             settings,
             tracer.clearance,
-            lambda frame: (tracer if motion is None else Tracer(motion.at(frame))).clearance,
+            lambda frame: (tracer if motion is None else motion.at(frame).tracer).clearance,
         )
     if settings.trajectory == "inspection":
         poses = inspecting_path(centre_line, settings, tracer)
@@ -429,20 +420,14 @@ def camera_path(
     return poses
 
 
-def every_8th(index: int) -> bool:
-    """Return whether a frame is held out by the default split: 0, 8, 16, ..."""
-    return index % TEST_EVERY == 0
-
-
 def turn_away(
-    poses: Float[np.ndarray, "T 4 4"], settings: PhantomSettings, is_test: Callable[[int], bool] = every_8th
+    poses: Float[np.ndarray, "T 4 4"], settings: PhantomSettings, training: Sequence[int]
 ) -> list[RotationView]:
     """Test views at positions of training frames, rotated by 15 to 30 degrees.
 
     On a pullback they are rotated in all directions; on a rotation trajectory further outwards.
     """
     generator = stream(settings.seed, Purpose.ROTATION_VIEWS)
-    training = [index for index in range(len(poses)) if not is_test(index)]
     views = []
     clock = generator.uniform(0.0, 2.0 * np.pi)
     for number in range(settings.rotation_views):

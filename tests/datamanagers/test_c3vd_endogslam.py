@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.scenes import Scene
 from coliags_plugin.geometry.poses.trajectory import inverse, rigid, wxyz_from_rotations
-from coliags_plugin.phantom.layouts.built_in import depth_steps
+from coliags_plugin.phantom.layouts import depth_steps
 from tests.datamanagers.kinds import change_npz, files
 from tests.datamanagers.wall_scenes import (
     HEIGHT,

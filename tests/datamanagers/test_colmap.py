@@ -21,7 +21,7 @@ from coliags_plugin.core.scenes import Frame
 from coliags_plugin.datamanagers.colmap import find_models, read_model
 from coliags_plugin.datamanagers.recorded import Recording
 from coliags_plugin.engine.data_formats import find_format
-from coliags_plugin.phantom.layouts.built_in import SeenPoints, add_points
+from coliags_plugin.phantom.layouts import SeenPoints, add_points
 from tests.datamanagers.kinds import change_lines, change_model
 from tests.datamanagers.wall_scenes import colors, load_scene, look, manager, off_wall, poses, seen_from
 

@@ -13,7 +13,7 @@ from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.core.scenes import Frame, Scene
 from coliags_plugin.datamanagers.recorded import RecordedDataManager
 from coliags_plugin.geometry.lenses.models import Lens, PinholeLens
-from coliags_plugin.phantom.layouts.base import Layout, PhantomFrame, WallPoints
+from coliags_plugin.phantom.layouts import Layout, PhantomFrame, WallPoints
 
 #: The wall is where NORMAL . x = OFFSET (mm).
 NORMAL = np.array([0.2, -0.1, 1.0])

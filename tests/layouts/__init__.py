@@ -7,7 +7,7 @@ from importlib import import_module
 from pathlib import Path
 
 from coliags_plugin.config.registry import phantom_layouts
-from coliags_plugin.phantom.layouts.base import Layout
+from coliags_plugin.phantom.layouts import Layout
 
 for path in sorted(Path(__file__).parent.glob("[!_]*.py")):
     module = import_module(f"{__name__}.{path.stem}")

@@ -6,8 +6,7 @@ from coliags_plugin.core.files import atomic_write
 from coliags_plugin.core.images import write_image
 from coliags_plugin.datamanagers.c3vd import CANDIDATE_LENS, INTRINSICS, ORDER
 from coliags_plugin.geometry.lenses.models import LENSES, octagon_mask
-from coliags_plugin.phantom.layouts.base import Layout, part_folder
-from coliags_plugin.phantom.layouts.built_in import depth_steps, write_poses
+from coliags_plugin.phantom.layouts import Layout, depth_steps, part_folder, write_poses
 
 
 class C3VDRawLayout(Layout):

@@ -12,9 +12,9 @@ from coliags_plugin.datamanagers.c3vd_endogslam import OPTIMIZED, PARAMS, PREPAR
 from coliags_plugin.geometry.lenses.models import PinholeLens
 from coliags_plugin.geometry.poses import endogslam
 from coliags_plugin.geometry.poses.trajectory import Trajectory, inverse
-from coliags_plugin.phantom.layouts.base import Layout, part_folder
-from coliags_plugin.phantom.layouts.built_in import write_poses
-from coliags_plugin.phantom.trajectory import TEST_EVERY
+from coliags_plugin.phantom.layouts import Layout, part_folder
+from coliags_plugin.phantom.layouts import write_poses
+from coliags_plugin.phantom.layouts import TEST_EVERY
 
 #: Folder and scene of PR-Endo's release, and the iteration of its Gaussians.
 _DATA, _SCENE, _ITERATION = "C3VD", "phantom", 30_000

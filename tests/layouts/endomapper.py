@@ -11,8 +11,7 @@ from coliags_plugin.geometry.lenses.models import FisheyeLens
 from coliags_plugin.geometry.lenses.vicalib import TYPE
 from coliags_plugin.geometry.poses import tum
 from coliags_plugin.geometry.poses.trajectory import Trajectory
-from coliags_plugin.phantom.layouts.base import Layout
-from coliags_plugin.phantom.layouts.built_in import DEPTH_SCALE, depth_steps
+from coliags_plugin.phantom.layouts import DEPTH_SCALE, Layout, depth_steps
 
 CALIBRATION = "calibration.xml"
 #: Like a colonoscope's: 150 degrees of view across the frame.

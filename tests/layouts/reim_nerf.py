@@ -11,7 +11,7 @@ from coliags_plugin.core.images import write_image
 from coliags_plugin.datamanagers.reim_nerf import C3VD_RANGE, MASK_FILE, PARTS, ray_cosines
 from coliags_plugin.geometry.lenses.models import LENSES
 from coliags_plugin.geometry.poses.trajectory import FLIP_Y_AND_Z
-from coliags_plugin.phantom.layouts.base import Layout
+from coliags_plugin.phantom.layouts import Layout
 
 #: Normalised units per mm. REIM-NeRF's own are 0.0092 to 0.0229, so that a scene lies between -1 and 1.
 SCENE_SCALE = 0.0095

@@ -14,7 +14,7 @@ from coliags_plugin.core.scene_files import write_unit
 from coliags_plugin.datamanagers.rotatecolon import POINTS, TEST, TRAIN, TRAIN_DEPTH, TRAIN_VIEWS
 from coliags_plugin.geometry.lenses.models import PinholeLens
 from coliags_plugin.geometry.poses.trajectory import FLIP_Y_AND_Z
-from coliags_plugin.phantom.layouts.base import Layout
+from coliags_plugin.phantom.layouts import Layout
 
 _TEST_VIEWS = "test_views_1"
 #: Stored depth per mm, as in the dataset, and Blender's depth of the background.

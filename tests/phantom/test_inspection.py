@@ -35,7 +35,7 @@ def colon(request):
     """A colon, and the paths through it by preset."""
     chosen = PhantomSettings(**COARSE, seed=request.param)
     anatomy = grow_anatomy(chosen)
-    tracer = Tracer(build_surface(anatomy, chosen))
+    tracer = build_surface(anatomy, chosen).tracer
     colon = SimpleNamespace(settings=chosen, centre_line=anatomy.centre_line, tracer=tracer)
     colon.paths = {light: path_of(colon, light=light) for light in PRESETS}
     return colon

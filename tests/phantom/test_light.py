@@ -52,9 +52,7 @@ def photograph_plane(distance: float, lights: tuple[CameraLight, ...], vignettin
     surface = plane_at(distance)
     lens = PinholeLens(20.0, 20.0, 12.5, 9.5, 25, 19)
     sensor = Sensor.behind(lens, np.ones((19, 25), bool), 1)
-    world = World(surface, plain_mucosa(), Tracer(surface), lights, vignetting)
-    exposure = expose(world, sensor, np.eye(4), None)
-    return sensor, exposure
+    return sensor, expose(World(surface, plain_mucosa(), lights, vignetting), sensor, np.eye(4))
 
 
 def directions(theta: np.ndarray, phi: np.ndarray) -> np.ndarray:
@@ -116,7 +114,7 @@ def test_interreflection_in_a_sphere_is_the_integrating_spheres():
     sphere = sphere_around(20.0, 60, 96)
     albedo = np.broadcast_to(np.array(ALBEDO, np.float32), (len(sphere.vertices), 3))
     patches = make_patches(sphere, albedo, stream(0, Purpose.INTERREFLECTION))
-    factors = form_factors(patches, Tracer(sphere))
+    factors = form_factors(patches, sphere.tracer)
     assert factors.sum(axis=1).max() <= 1.0 + 1e-9
     np.testing.assert_allclose(factors.sum(axis=1).mean(), 1.0, atol=0.05)
     indirect = solve(patches, factors, np.ones((len(patches.areas), 1)))[0]
@@ -151,7 +149,8 @@ def test_an_image_is_the_sum_of_its_lamps_with_their_own_glints_and_shadows():
 
     surface = plane_at(12.0)
     sensor = Sensor.behind(PinholeLens(20.0, 20.0, 12.5, 9.5, 25, 19), np.ones((19, 25), bool), 1)
-    shadowed = expose(World(surface, plain_mucosa(), Curtained(surface), lights, 0.0), sensor, np.eye(4), None)
+    vars(surface)["tracer"] = Curtained(surface.vertices, surface.triangles)
+    shadowed = expose(World(surface, plain_mucosa(), lights, 0.0), sensor, np.eye(4))
     np.testing.assert_allclose(shadowed.radiance, alone[0], rtol=1e-5)
 
 
@@ -161,7 +160,7 @@ def test_indirect_light_is_that_of_all_lamps():
 
     def solved(*lights):
         generator = stream(0, Purpose.INTERREFLECTION)
-        return indirect_lights(sphere, albedo, Tracer(sphere), lights, [np.eye(4)], 1.0, generator)[0].irradiance
+        return indirect_lights(sphere, albedo, lights, np.eye(4)[None], 1.0, generator)[0].irradiance
 
     lights = [lamp(offset=offset, share=share) for offset, share in zip(GUIDES, (0.5, 0.3, 0.2), strict=True)]
     np.testing.assert_allclose(solved(*lights), sum(solved(light) for light in lights), rtol=1e-5)

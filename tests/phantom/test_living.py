@@ -18,7 +18,6 @@ from coliags_plugin.phantom.generate import PreparedPhantom, generate, prepare
 from coliags_plugin.phantom.imaging import Sensor
 from coliags_plugin.phantom.props import Cover
 from coliags_plugin.phantom.settings import PhantomSettings
-from coliags_plugin.phantom.tracing import Tracer
 from coliags_plugin.phantom.trajectory import poses_between, poses_during, rotation
 from tests.phantom.phantom_layouts import TINY
 
@@ -172,7 +171,7 @@ def test_an_examination_turns_fast_and_touches_the_moving_wall():
     )
     phantom = prepared(settings)
     clear = [
-        Tracer(phantom.motion.at(frame)).clearance(pose[None, :3, 3])[0]
+        phantom.motion.at(frame).tracer.clearance(pose[None, :3, 3])[0]
         for frame, pose in enumerate(phantom.poses)
         if frame % 2 == 0
     ]

@@ -21,7 +21,7 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.engine.data_formats import find_format
 from coliags_plugin.phantom import light as lighting
 from coliags_plugin.phantom.generate import generate, resolve
-from coliags_plugin.phantom.layouts.base import Layout
+from coliags_plugin.phantom.layouts import Layout
 from coliags_plugin.phantom.settings import IN_VIVO, PhantomSettings, phantom_settings
 from tests.phantom.phantom_layouts import TINY as TINIEST
 from tests.phantom.phantom_layouts import write_phantom

@@ -16,8 +16,8 @@ from scipy.spatial.transform import Rotation
 
 from coliags_plugin.geometry.lenses.models import PinholeLens
 from coliags_plugin.phantom.generate import displaced, estimated_depth, generate, pose_errors, prepare
-from coliags_plugin.phantom.imaging import Sensor
-from coliags_plugin.phantom.response import (
+from coliags_plugin.phantom.imaging import (
+    Sensor,
     develop,
     encode,
     encoded,

@@ -12,7 +12,7 @@ from coliags_plugin.core.images import write_image
 from coliags_plugin.core.scene_files import write_unit
 from coliags_plugin.datamanagers.colmap import ATLAS_FILE
 from coliags_plugin.geometry.poses.colmap import write_reconstruction
-from coliags_plugin.phantom.layouts.built_in import SeenPoints, add_points
+from coliags_plugin.phantom.layouts import SeenPoints, add_points
 from coliags_plugin.pipeline import reconstruct, steps
 from coliags_plugin.pipeline.reconstruct import StageTask
 from coliags_plugin.pipeline.stages import StageRecord

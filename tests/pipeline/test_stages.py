@@ -22,7 +22,7 @@ from coliags_plugin.datamanagers.colmap import ATLAS_FILE, read_atlas
 from coliags_plugin.engine.data_formats import UNKNOWN_MEDIAN_DEPTH
 from coliags_plugin.engine.tasks import ExecutionOptions, TaskOutcome
 from coliags_plugin.geometry.poses import colmap
-from coliags_plugin.phantom.layouts.built_in import SeenPoints, add_points
+from coliags_plugin.phantom.layouts import SeenPoints, add_points
 from coliags_plugin.pipeline import stages, steps
 from coliags_plugin.pipeline.reconstruct import StageJob, StageJobs
 from coliags_plugin.pipeline.settings import ReconstructionSettings

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from coliags_plugin.geometry.poses.colmap import colmap_poses, posed_model
-from coliags_plugin.phantom.layouts.built_in import SeenPoints, add_points
+from coliags_plugin.phantom.layouts import SeenPoints, add_points
 from coliags_plugin.reconstruction.structure.point_tracks import FramePoints
 from tests.textured_tube import INTRINSICS, tube_frames
 

@@ -12,7 +12,7 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.geometry.lenses.models import LENSES
 from coliags_plugin.geometry.poses.colmap import posed_model
-from coliags_plugin.phantom.layouts.built_in import SeenPoints, add_points
+from coliags_plugin.phantom.layouts import SeenPoints, add_points
 from coliags_plugin.reconstruction.structure.hypotheses import (
     Hypothesis,
     choose,

@@ -1,4 +1,4 @@
-"""Depth of a run seen from its training poses, weighted by pixel; colours of places from the views that see them best."""
+"""Depth of a run from its training poses, weighted by pixel, and colours of places from the views that see them."""
 
 from __future__ import annotations
 

@@ -1,26 +1,114 @@
-"""The layouts that phantoms are written in: C3VD's, COLMAP's, nerfstudio's and TUM's (docs/layouts)."""
+"""The folder layouts a phantom can be written in (docs/layouts): C3VD's, COLMAP's, nerfstudio's and TUM's.
+
+To add one, subclass :class:`Layout` in a module of its own and register it in
+:data:`coliags_plugin.config.registry.phantom_layouts`.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8, UInt16
 
 from coliags_plugin.core.files import atomic_write, write_json
 from coliags_plugin.core.images import write_image
+from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.core.scene_files import write_camera_json, write_unit
-from coliags_plugin.geometry.lenses.models import Lens, OpenCVLens
+from coliags_plugin.geometry.lenses.models import Lens, OpenCVLens, PinholeLens
 from coliags_plugin.geometry.poses import tum
 from coliags_plugin.geometry.poses.c3vd import matrix_lines
 from coliags_plugin.geometry.poses.colmap import colmap_poses, posed_model, write_reconstruction
 from coliags_plugin.geometry.poses.trajectory import FLIP_Y_AND_Z, Trajectory, inverse
-from coliags_plugin.phantom.layouts.base import Layout, Part, PhantomFrame, WallPoints, part_folder
 
 if TYPE_CHECKING:
     import pycolmap
+
+#: ``video``: the sequence itself. ``rotation``: the rotated test views at its positions.
+Part = Literal["video", "rotation"]
+
+#: Interval of held-out test frames.
+TEST_EVERY = 8
+
+#: Intrinsics of C3VD's undistorted frames (docs/phantom.md 3); the calibration counts from integers, hence + 0.5.
+_C3VD_PINHOLE = Intrinsics(200.8769, 200.4713, 167.3190 + 0.5, 136.9333 + 0.5, 338, 270)
+
+
+@dataclass(frozen=True)
+class PhantomFrame:
+    """One frame of a phantom."""
+
+    part: Part
+    index: int  # within its part, from 0
+    color: UInt8[np.ndarray, "H W 3"]  # RGB
+    z_depth: Float[np.ndarray, "H W"]  # mm; 0 where there is no wall
+
+
+@dataclass(frozen=True)
+class WallPoints:
+    """Points of the wall that training frames see, as a stand-in for structure-from-motion points."""
+
+    positions: Float[np.ndarray, "N 3"]  # world, mm
+    colors: UInt8[np.ndarray, "N 3"]  # RGB from a training frame
+    seen_in: Callable[[int], Bool[np.ndarray, "N"]]  # those that a frame of the sequence sees, by its index
+
+
+class Layout(ABC):
+    """Interface of a folder layout that a phantom is written in: the files of a data format (docs/layouts).
+
+    A folder is written in this order: every frame of the video, every rotation view, then :meth:`write_sequence` for
+    the video and for the rotation views, then :meth:`write_points`. ``phantom.json`` and ``truth/`` are the same in
+    every layout and not written by it.
+    """
+
+    #: Default width and height, pixels.
+    default_size: ClassVar[tuple[int, int]] = (338, 270)
+    #: Whether the layout supports rotation views; otherwise none are rendered.
+    has_rotation: ClassVar[bool] = False
+    #: Whether the layout supports initial points.
+    has_points: ClassVar[bool] = False
+
+    def lens(self, width: int, height: int) -> tuple[Lens, Bool[np.ndarray, "H W"]]:
+        """The lens of frames of this size, and the mask of lit pixels [H, W].
+
+        Default: C3VD's undistorted camera, scaled by width, its principal point at the same distance from the middle;
+        all pixels are lit.
+        """
+        k = _C3VD_PINHOLE
+        scale = width / k.width
+        cx = 0.5 * width + (k.cx - 0.5 * k.width) * scale
+        cy = 0.5 * height + (k.cy - 0.5 * k.height) * scale
+        return PinholeLens(k.fx * scale, k.fy * scale, cx, cy, width, height), np.ones((height, width), bool)
+
+    def is_test(self, index: int) -> bool:
+        """Return whether a frame of the video is held out by the layout's split; default: 0, 8, 16, ..."""
+        return index % TEST_EVERY == 0
+
+    @abstractmethod
+    def write_frame(self, folder: Path, frame: PhantomFrame) -> None:
+        """Write one frame into the folder of the phantom."""
+
+    @abstractmethod
+    def write_sequence(self, folder: Path, part: Part, poses: Float[np.ndarray, "N 4 4"], lens: Lens) -> None:
+        """Write the poses (camera-to-world, OpenCV axes, mm) of a part and, if in the layout, its lens, the camera."""
+
+    def write_points(self, folder: Path, points: WallPoints, poses: Float[np.ndarray, "N 4 4"], lens: Lens) -> None:
+        """Write initial points; called if :attr:`has_points`. ``poses`` are those of the video."""
+        raise NotImplementedError(f"{type(self).__name__} does not support points")
+
+    def seen_mask(self, folder: Path, part: Part, index: int) -> Path:
+        """Path of the seen mask of a test frame."""
+        return folder / ("truth" if part == "video" else part) / "seen" / f"{index:04d}_seen.png"
+
+
+def part_folder(folder: Path, part: Part) -> Path:
+    """Folder of a part, for layouts with rotation views in ``rotation/``."""
+    return folder if part == "video" else folder / part
+
 
 #: The largest number of 16 bits.
 _LAST = 65_535
