@@ -12,9 +12,7 @@ from coliags_plugin.datamanagers.c3vd_endogslam import OPTIMIZED, PARAMS, PREPAR
 from coliags_plugin.geometry.lenses.models import PinholeLens
 from coliags_plugin.geometry.poses import endogslam
 from coliags_plugin.geometry.poses.trajectory import Trajectory, inverse
-from coliags_plugin.phantom.layouts import Layout, part_folder
-from coliags_plugin.phantom.layouts import write_poses
-from coliags_plugin.phantom.layouts import TEST_EVERY
+from coliags_plugin.phantom.layouts import TEST_EVERY, Layout, part_folder, write_poses
 
 #: Folder and scene of PR-Endo's release, and the iteration of its Gaussians.
 _DATA, _SCENE, _ITERATION = "C3VD", "phantom", 30_000
