@@ -144,7 +144,7 @@ class DepthCommand:
         from coliags_plugin.core.errors import InputError
         from coliags_plugin.engine.data_formats import open_scene
         from coliags_plugin.engine.progress import progress_callback
-        from coliags_plugin.reconstruction.depth.scene import DepthRequest, estimate_scene, training_options
+        from coliags_plugin.reconstruction.depth.scene import estimate_scene, training_options
         from coliags_plugin.reconstruction.depth.sweeping import DepthEstimationSettings
 
         arguments.refuse_output(self.output, self.scene, self.overwrite)
@@ -158,8 +158,9 @@ class DepthCommand:
             reading = ["initial_points=none", "keep_pixels=false", *options]
             scene = open_scene(self.scene, self.data_format, reading, progress)
             near_far = None if self.near is None or self.far is None else (self.near, self.far)
-            request = DepthRequest(settings, near_far, self.prior, self.jobs)
-            estimated = estimate_scene(scene, self.output, request, self.overwrite, progress)
+            estimated = estimate_scene(
+                scene, self.output, settings, near_far, self.prior, self.jobs, self.overwrite, progress
+            )
         for warning in estimated.warnings:
             logging.getLogger(__name__).warning(warning)
         train = train_command(self.output, ESTIMATED_DEPTH_METHOD, training_options(scene))

@@ -310,10 +310,11 @@ def check_data(context: StageContext) -> StageRecord:
 
 def estimate_depth(context: StageContext) -> StageRecord:
     """Estimate dense depth with its confidence; goes on where a kill has left it."""
-    from coliags_plugin.reconstruction.depth.scene import DepthRequest, estimate_scene
+    from coliags_plugin.reconstruction.depth.scene import estimate_scene
 
-    request = DepthRequest(context.settings.depth)
-    estimated = estimate_scene(context.open_posed(), context.scene, request, overwrite=True, progress=context.progress)
+    estimated = estimate_scene(
+        context.open_posed(), context.scene, context.settings.depth, overwrite=True, progress=context.progress
+    )
     files = {"depth": "scene in nerfstudio's layout: images, poses, depth, confidence, points"}
     return StageRecord(estimated.summary, files, estimated.warnings)
 

@@ -49,7 +49,9 @@ class Undistortion:
         self.source_mask = source_mask
         self.width, self.height = width, height = pinhole.width, pinhole.height
         self._columns, self._rows = undistortion_map(lens, pinhole)
-        step = _longest_step(self._columns, self._rows)
+        # Source pixels per result pixel where the map is coarsest, leaving out the rim it does not reach.
+        steps = [np.hypot(np.diff(self._columns, axis=axis), np.diff(self._rows, axis=axis)) for axis in (0, 1)]
+        step = float(np.quantile(np.concatenate([side.ravel() for side in steps]), 0.95)) if width * height > 1 else 1.0
         most = math.ceil(_MOST_SAMPLES * max(lens.width / width, lens.height / height))
         self.supersampling = s = max(1, min(round(step), most))
         self._fine_columns, self._fine_rows = self._columns, self._rows
@@ -81,9 +83,3 @@ class Undistortion:
         picked = np.full(columns.shape, fill, values.dtype)
         picked[inside] = values[row[inside], column[inside]]
         return picked
-
-
-def _longest_step(columns: np.ndarray, rows: np.ndarray) -> float:
-    """Source pixels per result pixel where the map is coarsest, leaving out the rim it does not reach."""
-    steps = [np.hypot(np.diff(columns, axis=axis), np.diff(rows, axis=axis)).ravel() for axis in (0, 1)]
-    return float(np.quantile(np.concatenate(steps), 0.95)) if columns.size > 1 else 1.0

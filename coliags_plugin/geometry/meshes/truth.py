@@ -49,7 +49,12 @@ def read_true_surface(path: Path) -> TrueSurface:
     mesh, textures = read_flagged_mesh(path)
     flags = path.parent / "mesh_seen.npz"
     if path.suffix.lower() == ".ply" and flags.is_file():
-        seen = _phantom_flags(flags, "face_seen", mesh)
+        seen = read_arrays(flags, "an NPZ file with 'face_seen'", ["face_seen"])["face_seen"]
+        if seen.shape != (len(mesh),) or seen.dtype != bool:
+            raise InputError(
+                f"{flags} has {seen.dtype} flags of shape {list(seen.shape)}",
+                f"one bool for each of {len(mesh)} triangles",
+            )
         return TrueSurface(path, mesh, seen, "first hit of a pixel of a training frame")
     if textures is not None and set(np.unique(textures)) <= {_OBSERVED, _UNOBSERVED}:
         seen = textures == _OBSERVED
@@ -57,15 +62,6 @@ def read_true_surface(path: Path) -> TrueSurface:
             raise InputError(f"{path} marks no triangle as seen", "vt 1 at the triangles that were observed")
         return TrueSurface(path, mesh, seen, "observed in any frame, by its vt 1")
     return TrueSurface(path, mesh, np.ones(len(mesh), bool), "")
-
-
-def _phantom_flags(path: Path, key: str, mesh: TriangleMesh) -> Bool[np.ndarray, "F"]:
-    seen = read_arrays(path, f"an NPZ file with '{key}'", [key])[key]
-    if seen.shape != (len(mesh),) or seen.dtype != bool:
-        raise InputError(
-            f"{path} has {seen.dtype} flags of shape {list(seen.shape)}", f"one bool for each of {len(mesh)} triangles"
-        )
-    return seen
 
 
 #: Distances within which a point counts as right, scene units (mm).

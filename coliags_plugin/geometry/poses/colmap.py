@@ -394,12 +394,12 @@ def write_reconstruction(folder: Path, model: pycolmap.Reconstruction, text: boo
         written = pycolmap.Reconstruction(str(folder))
     except Exception as error:  # what pycolmap raises depends on where the file ends
         raise incomplete from error
-    if _counts(written) != _counts(model):
+    counts = [
+        (each.num_cameras(), each.num_reg_images(), each.num_points3D(), each.compute_num_observations())
+        for each in (written, model)
+    ]
+    if counts[0] != counts[1]:
         raise incomplete
-
-
-def _counts(model: pycolmap.Reconstruction) -> tuple[int, ...]:
-    return model.num_cameras(), model.num_reg_images(), model.num_points3D(), model.compute_num_observations()
 
 
 def read_pinholes(path: Path) -> dict[int, Intrinsics | str]:

@@ -19,25 +19,15 @@ from coliags_plugin.geometry.poses.trajectory import Trajectory
 
 @dataclass(frozen=True)
 class Format:
-    """A pose file format.
+    """A pose file format."""
 
-    Attributes:
-        name: Name on the command line.
-        read: Reads a file or folder.
-        write: Writes a file or folder, replacing an existing one; None if the format is read-only.
-        recognise: Whether a path has this format, by content; None if another format recognises it.
-        unit: Its unit of length, or ``"units"`` if the format defines none.
-        keeps: Further stored data: ``names``, ``timestamps``, ``intrinsics``, ``cameras`` of each pose.
-        folder: Whether the format is a folder of files.
-    """
-
-    name: str
-    read: Callable[[Path], Trajectory]
-    write: Callable[[Path, Trajectory], None] | None
-    recognise: Callable[[Path], bool] | None
-    unit: str = "units"
-    keeps: frozenset[str] = frozenset()
-    folder: bool = False
+    name: str  # on the command line
+    read: Callable[[Path], Trajectory]  # a file or folder
+    write: Callable[[Path, Trajectory], None] | None  # replaces an existing one; None: the format is read-only
+    recognise: Callable[[Path], bool] | None  # by content; None: another format recognises it
+    unit: str = "units"  # of length; "units": the format defines none
+    keeps: frozenset[str] = frozenset()  # further stored data: names, timestamps, intrinsics, cameras of each pose
+    folder: bool = False  # a folder of files
 
 
 def format_named(name: str) -> Format:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
@@ -20,7 +19,7 @@ from coliags_plugin.core.scenes import Frame, Scene
 from coliags_plugin.core.splits import split_options
 from coliags_plugin.datamanagers.nerfstudio import EstimatedSceneWriter
 from coliags_plugin.datamanagers.shots import PAPER_SIZE, fitted
-from coliags_plugin.reconstruction.depth.estimate import Estimation, WorkFolder, check_video, work_folder
+from coliags_plugin.reconstruction.depth.estimate import Estimation, check_video, work_folder
 from coliags_plugin.reconstruction.depth.priors import DepthRange, FilePrior, LightPrior, find_range, given_range
 from coliags_plugin.reconstruction.depth.sweeping import DepthEstimationSettings, Map, Mask
 from coliags_plugin.reconstruction.structure.features import Pose, image_and_mask
@@ -29,22 +28,10 @@ log = logging.getLogger(__name__)
 
 #: Confidence from which a pixel counts as known in the summary.
 _KNOWN = 0.5
-#: Shares of the known pixels between whose depths the summary's range is, and the number of logarithmic bins of depth.
-_SHARES, _BINS = (0.01, 0.99), 2000
 #: Changes when the results of the same request do, so that old work files are not mixed with new ones.
 _VERSION = 6
 #: Edge of the voxels of points, pixels on the surface.
 _VOXEL = 2.0
-
-
-@dataclass(frozen=True)
-class DepthRequest:
-    """Request for the depth of a scene."""
-
-    settings: DepthEstimationSettings
-    near_far: tuple[float, float] | None = None  # depth range, scene units; None: found
-    prior: Path | None = None  # folder of depth maps; None: brightness
-    jobs: int | None = None  # number of threads; None: one for each core
 
 
 class EstimatedDepth(NamedTuple):
@@ -55,13 +42,23 @@ class EstimatedDepth(NamedTuple):
 
 
 def estimate_scene(
-    scene: Scene, out: Path, request: DepthRequest, overwrite: bool = False, progress: Progress | None = None
+    scene: Scene,
+    out: Path,
+    settings: DepthEstimationSettings,
+    near_far: tuple[float, float] | None = None,
+    prior: Path | None = None,
+    jobs: int | None = None,
+    overwrite: bool = False,
+    progress: Progress | None = None,
 ) -> EstimatedDepth:
     """Estimate the depth of a posed scene's video, and write it as a scene in nerfstudio's layout.
 
     The depth of training frames, the range and the points are made of training frames alone; that of a test frame of
     its own image and training frames. Test sets of other names are left out. Work files stay beside ``out`` until all
     is written, and the same request resumes from them.
+
+    ``near_far`` is the depth range, scene units, which is found where it is None; ``prior`` a folder of depth maps in
+    place of the brightness; ``jobs`` the number of threads, one for each core by default.
     """
     frames = scene.video
     trained = {frame.name for frame in scene.train}
@@ -69,7 +66,7 @@ def estimate_scene(
     if others := [name for name in scene.test_sets if name != "test"]:
         log.warning("left out: %s, which are apart from the video", ", ".join(others))
     check_video(frames, sources)
-    prior = LightPrior() if request.prior is None else FilePrior.of(request.prior, frames)
+    depth_prior = LightPrior() if prior is None else FilePrior.of(prior, frames)
     described = {
         "version": _VERSION,
         "data": scene.provenance.fingerprint,
@@ -77,14 +74,20 @@ def estimate_scene(
         "sources": sources,
         "size": [frames[0].camera.width, frames[0].camera.height],
         "poses": [frame.camera.camera_to_world.flatten().tolist() for frame in frames],
-        "settings": request.settings.model_dump(),
-        "near_far": request.near_far,
-        "prior": prior.described(),
+        "settings": settings.model_dump(),
+        "near_far": near_far,
+        "prior": depth_prior.described(),
     }
     with work_folder(out, described) as work:
-        depth_range = _range(frames, sources, request, work, progress)
-        jobs = request.jobs or os.cpu_count() or 1
-        estimation = Estimation(frames, sources, prior, depth_range, request.settings, work, jobs, progress)
+        if near_far is None:
+            used = [frames[index] for index in sources]
+            measured = work.value("range", lambda: vars(find_range(used, settings.features, progress)))
+            medians = np.exp(np.interp(np.arange(len(frames)), sources, np.log(measured["medians"])))
+            depth_range = DepthRange(measured["near"], measured["far"], tuple(medians.tolist()))
+        else:
+            depth_range = given_range(*near_far, len(frames))
+        jobs = jobs or os.cpu_count() or 1
+        estimation = Estimation(frames, sources, depth_prior, depth_range, settings, work, jobs, progress)
         estimation.run()
         with atomic_folder(out, overwrite) as folder:
             estimated = _write(scene, frames, estimation, folder, progress)
@@ -100,22 +103,6 @@ def training_options(scene: Scene) -> list[str]:
     return options
 
 
-def _range(
-    frames: Sequence[Frame],
-    sources: Sequence[int],
-    request: DepthRequest,
-    work: WorkFolder,
-    progress: Progress | None,
-) -> DepthRange:
-    """The range stated, or that of the sources; other frames' medians are interpolated between theirs."""
-    if request.near_far is not None:
-        return given_range(*request.near_far, len(frames))
-    used = [frames[index] for index in sources]
-    stored = work.value("range", lambda: vars(find_range(used, request.settings.features, progress)))
-    medians = np.exp(np.interp(np.arange(len(frames)), sources, np.log(stored["medians"])))
-    return DepthRange(stored["near"], stored["far"], tuple(medians.tolist()))
-
-
 def _write(
     scene: Scene, frames: Sequence[Frame], estimation: Estimation, folder: Path, progress: Progress | None
 ) -> EstimatedDepth:
@@ -125,10 +112,8 @@ def _write(
     typical = np.median([estimation.medians[index] for index in estimation.sources])
     footprint = float(typical) / float(np.sqrt(k.fx * k.fy))
     voxels = VoxelPoints(_VOXEL * footprint, frames[len(frames) // 2].camera.center.cpu().double().numpy())
-    pixels = 0
+    pixels = confident = 0
     distrusted: dict[str, list[str]] = {}
-    log_range = np.log([estimation.range.near, estimation.range.far])
-    counts = np.zeros(_BINS, np.int64)
     for index, stored in enumerate(with_progress(frames, "write", progress)):
         frame, (depth, confidence, distrust) = stored.to("cpu"), estimation.result(index)
         if distrust:
@@ -140,10 +125,8 @@ def _write(
         if index in estimation.sources:
             voxels.add(Pose.of(frame.camera), depth, confidence, image)
         pixels += int(frame.valid.sum())
-        logs = np.clip(np.log(depth[confidence >= _KNOWN]), *log_range)
-        counts += np.histogram(logs, _BINS, (log_range[0], log_range[1]))[0]
+        confident += int((confidence >= _KNOWN).sum())
     positions, colors = voxels.points()
-    confident = int(counts.sum())
     if not len(positions):
         raise InputError(
             f"no surface that {len(frames)} frames agree on: {100.0 * confident / max(pixels, 1):.1f} % of the pixels "
@@ -156,12 +139,8 @@ def _write(
     has_own_split = scene.provenance.split_name == "own"
     writer.finish(positions, colors, train, (train, test) if has_own_split else None)
     write_unit(folder, scene.provenance.unit)
-    bins = np.searchsorted(np.cumsum(counts), np.multiply(confident, _SHARES))
-    near, far = np.exp(log_range[0] + (log_range[1] - log_range[0]) * (bins + 0.5) / _BINS)
     share = f"{100.0 * confident / max(pixels, 1):.0f} % of the pixels with a confidence of {_KNOWN:g} or more"
-    summary = (
-        f"{len(frames)} frames, {share}, 98 % of these at depths of {near:.4g} to {far:.4g}; {len(positions)} points"
-    )
+    summary = f"{len(frames)} frames, {share}; {len(positions)} points"
     warnings = [
         f"{len(names)} of {len(frames)} frames have depth of confidence 0, {reason}: {', '.join(names)}"
         for reason, names in distrusted.items()

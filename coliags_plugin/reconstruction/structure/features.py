@@ -220,11 +220,8 @@ def epipolar_inliers(
 ) -> Bool[np.ndarray, "K"]:
     """True for inliers of an essential matrix with a typical endoscope's camera; none of fewer than 20 matches. [K]
 
-    Args:
-        first: Column and row, pixel centres at integers.
-        second: The same points in the other image.
-        shape: Height and width of both images.
-        max_error: RANSAC inlier threshold, pixels.
+    Matches are columns and rows, pixel centres at integers, in two images of a shape (height and width); ``max_error``,
+    pixels, is RANSAC's inlier threshold.
     """
     import pycolmap
 

@@ -63,10 +63,8 @@ def join_models(
     """Join models of tracks that show the same wall.
 
     A joined model is adjusted as a whole, with the points that were found again, and kept if held-out tracks are
-    hardly farther off than in its parts, nearer points are brighter, and its sides hold together.
-
-    Returns:
-        The video with the points found again, the models, and joins that were found but not made.
+    hardly farther off than in its parts, nearer points are brighter, and its sides hold together. Returns the video
+    with the points found again, the models, and joins that were found but not made.
     """
     compare = _Comparison(video, settings, masks)
     parts = list(models)

@@ -139,25 +139,15 @@ def _patches(texture: np.ndarray, at: np.ndarray) -> Float32[np.ndarray, "K 121"
 
 @dataclass(frozen=True, eq=False)
 class FramePoints:
-    """Tracked points of one frame.
+    """Tracked points of one frame."""
 
-    Attributes:
-        ids: Numbers of the tracks, ascending. [K]
-        pixels: Column and row in the frame, pixel centres at integers + 0.5. [K, 2]
-        brightness: Mean of red, green and blue around them, 0 to 255. [K]
-        followed: Number of points that came from the frame before.
-        shift: Their median displacement, as a share of the larger side.
-        sharpness: Of the frame (:func:`sharpness`).
-        fineness: Of the frame at the size that is tracked (:func:`fineness`).
-    """
-
-    ids: Int64[np.ndarray, "K"]
-    pixels: Float32[np.ndarray, "K 2"]
-    brightness: Float32[np.ndarray, "K"]
-    followed: int
-    shift: float
-    sharpness: float
-    fineness: float
+    ids: Int64[np.ndarray, "K"]  # numbers of the tracks, ascending
+    pixels: Float32[np.ndarray, "K 2"]  # column and row in the frame, pixel centres at integers + 0.5
+    brightness: Float32[np.ndarray, "K"]  # mean of red, green and blue around them, 0 to 255
+    followed: int  # number of points that came from the frame before
+    shift: float  # their median displacement, as a share of the larger side
+    sharpness: float  # of the frame
+    fineness: float  # of the frame at the size that is tracked
 
 
 def shared_tracks(first: FramePoints, second: FramePoints) -> Int64[np.ndarray, "M 2"]:
@@ -191,16 +181,7 @@ def track_points(
     """Track points through the frames of a video, of one size and in order, holding a few frames at a time.
 
     Around frames in which most points are lost, corners are also followed backwards: what is seen well after a fast
-    turn is often found in the blurred frames before it.
-
-    Args:
-        images: Files of the frames.
-        settings: Of tracking.
-        masks: False where a pixel is ignored; one for all frames, or one per frame.
-        progress: Progress callback.
-
-    Raises:
-        InputError: A frame cannot be read.
+    turn is often found in the blurred frames before it. Masks are False where a pixel is ignored.
     """
     forward = PointTracker(settings)
     points = []

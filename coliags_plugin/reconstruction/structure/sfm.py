@@ -124,13 +124,8 @@ def reconstruct(
     """Estimate poses and points by structure from motion.
 
     An unknown camera's model and focal length are chosen on a part of the video (:func:`find_camera`); with features
-    they are refined on the largest model, whose cameras the others get, unless their images have other sizes.
-
-    Args:
-        images: Files in video order. Images of the same size share a camera.
-        settings: Default: unknown camera.
-        masks: False where a pixel is ignored; one for all images, or one per image.
-        progress: Progress callback.
+    they are refined on the largest model, whose cameras the others get, unless their images have other sizes. Images
+    are in video order, and share a camera where they have one size; masks are False where a pixel is ignored.
 
     Raises:
         InputError: There are fewer than two images, one cannot be read, sizes differ where parameters are given, the

@@ -138,10 +138,7 @@ def test_a_prior_by_another_and_what_is_printed(wall, tmp_path, capsys):
     options = ("--set", "split=endogslam", "--set", "max_frames=6", "--near", 20, "--far", 80)
     assert run("depth", "estimate", wall, "--output", out, "--prior", priors, *OPTIONS, *options) == 0
     summary, written, command = capsys.readouterr().out.splitlines()
-    groups = re.fullmatch(r"6 frames, .+, 98 % of these at depths of (.+) to (.+); \d+ points", summary)
-    near, far = map(float, groups.groups())
-    depths = np.concatenate([frame.depth[frame.depth_confidence >= 0.5] for frame in open_scene(out).video])
-    assert [near, far] == pytest.approx(np.percentile(depths, [1.0, 99.0]), rel=2e-3)
+    assert re.fullmatch(r"6 frames, \d+ % of the pixels with a confidence of 0.5 or more; \d+ points", summary)
     assert written == f"written: {out}"
     assert command == f"next:    coliags train coliags-in-vivo --data {out} --set datamanager.split=endogslam"
     frames = frames_of(out)
