@@ -46,13 +46,11 @@ TRACKED = SfmSettings(camera=CameraSettings(model="PINHOLE", params=INTRINSICS),
 
 def test_a_model_is_weak_where_few_points_are_common_or_sides_have_another_scale():
     (link,) = weak_links(seen_points()[0])
-    assert (link.after, link.points) == (GAP, COMMON)
-    assert link.log_scale == pytest.approx(0.0, abs=1e-6)
+    assert (link.after, link.points) == (GAP, COMMON) and link.log_scale == pytest.approx(0.0, abs=1e-6)
     assert link.holds
     assert f"{COMMON} points seen from both sides" in link.reason
     links = {link.after: link for link in weak_links(seen_points(shift=25.0)[0])}
-    assert links[GAP].log_scale > 0.3
-    assert not links[GAP].holds
+    assert links[GAP].log_scale > 0.3 and not links[GAP].holds
 
 
 @pytest.mark.parametrize(("long", "is_weak"), [(3, True), (4, False)])
@@ -169,8 +167,7 @@ def test_places_between_models_are_told(tmp_path):
     atlas = reconstruct(images, windows)
     first, second = (span for _, span in atlas.submaps())
     (link,) = atlas.refused
-    assert link.after == first[-1] == second[0] - 1
-    assert link.points > 30
+    assert link.after == first[-1] == second[0] - 1 and link.points > 30
 
 
 @pytest.mark.thorough
@@ -183,8 +180,7 @@ def test_a_wall_that_moves_is_split(tmp_path, monkeypatch, caplog):
     assert [model.registered for model in atlas.models] == [tuple(range(13)), tuple(range(13, 25))]
     assert atlas.lost == {}
     (link,) = atlas.refused
-    assert link.after == 12
-    assert link.again.agreeing >= 10
+    assert link.after == 12 and link.again.agreeing >= 10
     assert link.reason.startswith("what is seen moves too far for one rigid model; ")
     assert "what is seen moves, as rigid for 10 frames: split in 2 models" in caplog.text
 
@@ -192,8 +188,7 @@ def test_a_wall_that_moves_is_split(tmp_path, monkeypatch, caplog):
 def test_tracks_give_every_frame_a_pose_and_the_atlas_is_written(tmp_path):
     tracked = reconstruct(list_images(write_tube(tmp_path / "tube", 8, 2.0) / "images"), TRACKED)
     assert tracked.lost == {} and tracked.submaps() == [(0, range(8))]
-    assert tracked.largest.registered == tuple(range(8))
-    assert tracked.largest.test_error < 0.6
+    assert tracked.largest.registered == tuple(range(8)) and tracked.largest.test_error < 0.6
     half = replace(
         tracked.largest, registered=(4, 5, 6), camera_to_world=tracked.largest.camera_to_world[4:7], links=()
     )
@@ -236,8 +231,7 @@ def test_sides_that_give_points_another_depth_contradict_each_other():
         pose[:, 3] = -pose[:, :3] @ center
         model.frames[model.images[number].frame_id].rig_from_world = pycolmap.Rigid3d(pose)
     (link,) = contradictions(model)
-    assert abs(link.after - GAP) <= 1
-    assert link.log_scale == pytest.approx(np.log(3.0), abs=0.2)
+    assert abs(link.after - GAP) <= 1 and link.log_scale == pytest.approx(np.log(3.0), abs=0.2)
     assert not link.holds
     assert contradictions(model, [Link(GAP, 9, None, None)]) == []
 
@@ -259,8 +253,7 @@ def test_the_residual_of_a_rigid_motion_is_that_of_noise_or_grows_with_time():
     assert max(measured().values()) < 1e-3
     noisy, moving = measured(noise=0.5), measured(speed=1.0)
     # Both ends of a track are noisy, and a part of the distance to the line is fitted: 0.67 times the deviation.
-    assert noisy[1] == pytest.approx(0.34, rel=0.4)
-    assert noisy[2] == pytest.approx(noisy[1], rel=0.5)
+    assert noisy[1] == pytest.approx(0.34, rel=0.4) and noisy[2] == pytest.approx(noisy[1], rel=0.5)
     assert moving[1] > 0.3 and moving[2] > 1.4 * moving[1]
     assert rigid_frames(pycolmap.Reconstruction(), []) is None
 
@@ -319,8 +312,7 @@ def test_models_of_the_same_wall_become_one(halves):
     again = joined.joins[HALF - 1]
     assert again.before == HALF
     assert again.agreeing >= 20  # of 32
-    assert again.spread < 0.05
-    assert again.similarity is None
+    assert again.spread < 0.05 and again.similarity is None
     centers = [
         np.array([model.images[number].projection_center() for number in range(1, LONG + 1)])
         for model in (joined.model, whole)
@@ -379,5 +371,4 @@ def test_stretches_end_at_other_models_and_at_cuts():
     models = [[0, 1, 2, 6, 7, 8, 9], [3, 4]]
     assert stretches_of(models, set()) == [range(3), range(3, 5), range(6, 10)]
     assert stretches_of(models, {7}) == [range(3), range(3, 5), range(6, 8), range(8, 10)]
-    assert stretches_of([[0, 4]], {2}) == [range(1), range(4, 5)]
-    assert stretches_of([], set()) == []
+    assert stretches_of([[0, 4]], {2}) == [range(1), range(4, 5)] and stretches_of([], set()) == []

@@ -208,8 +208,8 @@ def _median(parts: Sequence[Tensor]) -> float | None:
     return float(values.median()) if len(values) else None
 
 
-#: Features that are matched; largest ratio in Lowe's test, and largest distance of descriptors.
-_FEATURES, _MAX_RATIO, _MAX_DESCRIPTOR_DISTANCE = FeatureSettings(upright=False), 0.8, 0.7
+#: Features that are matched.
+_FEATURES = FeatureSettings(upright=False)
 #: Smallest number of matches of a usable pair.
 _MIN_MATCHES = 8
 #: An epipolar geometry passes through seven matches whatever they are. Smallest share of the others that it explains if
@@ -264,7 +264,7 @@ def match(pairs: Sequence[tuple[Frame, Frame]]) -> list[FrameMatches]:
         extract = feature_extractor(_FEATURES)
         for pair in pairs:
             first, second = (extract(frame.image.numpy(), frame.valid.numpy()) for frame in pair)
-            here, there = mutual_matches(first, second, _MAX_RATIO, _MAX_DESCRIPTOR_DISTANCE).T
+            here, there = mutual_matches(first, second).T
             matches += _explained(*pair, first.pixels[here], second.pixels[there])
     return matches
 

@@ -294,7 +294,6 @@ def linear_light(encoded: Float[np.ndarray, "V 3"]) -> Float[np.ndarray, "V 3"]:
 
 
 def _encoded(light: Float[np.ndarray, "V 3"]) -> UInt8[np.ndarray, "V 3"]:
-    """SRGB colours of linear light in [0, 1]. [V, 3]"""
     encoded = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
     return np.rint(encoded * 255.0).astype(np.uint8)
 

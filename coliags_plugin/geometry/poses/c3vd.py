@@ -93,9 +93,4 @@ def matrix_lines(camera_to_world: Float[np.ndarray, "N 4 4"], digits: int | None
     return "\n".join(lines) + "\n"
 
 
-def recognise(path: Path) -> bool:
-    """True if a file's first line holds sixteen numbers."""
-    return count_first_numbers(path) == 16
-
-
-FORMAT = Format("c3vd", read, write, recognise, unit="mm")
+FORMAT = Format("c3vd", read, write, lambda path: count_first_numbers(path) == 16, unit="mm")

@@ -143,8 +143,6 @@ def read_points(path: Path) -> list[ColmapPoint]:
 
 
 class _Cursor:
-    """Position in a binary file."""
-
     def __init__(self, path: Path) -> None:
         self.path, self.position = path, 0
         try:

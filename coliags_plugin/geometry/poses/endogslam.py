@@ -112,11 +112,6 @@ def write(path: Path, trajectory: Trajectory) -> None:
     write_arrays(path, arrays)
 
 
-def recognise(path: Path) -> bool:
-    """True if a file is a ZIP archive, as NPZ files are."""
-    return head(path).startswith(b"PK\x03\x04")
-
-
 def image_indices(poses: int, images: int) -> Int[np.ndarray, "F"] | None:
     """Image index of each of EndoGSLAM's poses: all, or all but 7, 15, 23, ...; None if the counts match neither. [F]
 
@@ -196,5 +191,12 @@ def _fault(key: str, array: np.ndarray, sizes: dict[str, int]) -> str:
 
 
 _KEEPS = frozenset({"intrinsics"})
-FORMAT = Format("endogslam", read, write, recognise, unit="mm", keeps=_KEEPS)
+FORMAT = Format(
+    "endogslam",
+    read,
+    write,
+    lambda path: head(path).startswith(b"PK\x03\x04"),  # a ZIP archive, as NPZ files are
+    unit="mm",
+    keeps=_KEEPS,
+)
 TRUTH_FORMAT = Format("endogslam-truth", read_truth, None, None, unit="mm", keeps=_KEEPS)

@@ -113,7 +113,6 @@ def _matrix(value: Any, place: str) -> np.ndarray:
 
 
 def _undo_applied_transform(path: Path, content: dict[str, Any], camera_to_world: np.ndarray) -> np.ndarray:
-    """Poses before nerfstudio's applied_transform and applied_scale."""
     applied = _matrix(content.get("applied_transform", np.eye(4)), f"{path}: applied_transform")
     check_rigid(applied[None], lambda _: f"{path}: applied_transform")
     scale = read_number({"applied_scale": 1.0} | content, "applied_scale", path, "a positive number", above=0.0)

@@ -95,9 +95,4 @@ def write(path: Path, trajectory: Trajectory) -> None:
     atomic_write(path, "\n".join(["# timestamp tx ty tz qx qy qz qw", *lines]) + "\n")
 
 
-def recognise(path: Path) -> bool:
-    """True if a file's first line, comments apart, holds eight numbers."""
-    return count_first_numbers(path) == 8
-
-
-FORMAT = Format("tum", read, write, recognise, keeps=frozenset({"timestamps"}))
+FORMAT = Format("tum", read, write, lambda path: count_first_numbers(path) == 8, keeps=frozenset({"timestamps"}))

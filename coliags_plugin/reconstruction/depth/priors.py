@@ -37,8 +37,6 @@ log = logging.getLogger(__name__)
 _FRAMES, _STEPS = 16, (1, 2, 4, 8, 16)
 #: Least triangulation angle, degrees, and largest Sampson distance, pixels.
 _LEAST_ANGLE, _ERROR = 1.0, 1.0
-#: Largest ratio in Lowe's test, and distance of descriptors.
-_MAX_RATIO, _MAX_DISTANCE = 0.8, 0.7
 #: Fewest points that give a range, and that give a frame's own median.
 _FEWEST_POINTS, _FEWEST_OF_FRAME = 30, 10
 #: Relative difference within which two partners must agree about a point.
@@ -108,7 +106,7 @@ def triangulated_depths(first: Features, second: Features, frame: Frame, partner
     turn = np.degrees(np.arccos(np.clip(float(frame.camera.optical_axis @ partner.camera.optical_axis), -1.0, 1.0)))
     if not np.linalg.norm(translation) > 0.0 or turn > MAX_TURN:
         return depths
-    pairs = mutual_matches(first, second, _MAX_RATIO, _MAX_DISTANCE)
+    pairs = mutual_matches(first, second)
     turned = rays(first.pixels[pairs[:, 0]], frame.camera) @ rotation.T
     opposite = rays(second.pixels[pairs[:, 1]], partner.camera)
     # Epipolar lines in either image; coefficients of x and y divided by the focal lengths give distances in pixels.

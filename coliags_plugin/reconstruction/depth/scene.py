@@ -106,7 +106,6 @@ def training_options(scene: Scene) -> list[str]:
 def _write(
     scene: Scene, frames: Sequence[Frame], estimation: Estimation, folder: Path, progress: Progress | None
 ) -> EstimatedDepth:
-    """Write all frames, the points and the unit."""
     writer = EstimatedSceneWriter(folder, estimation.range.far / 65000.0)
     k = frames[0].camera
     typical = np.median([estimation.medians[index] for index in estimation.sources])

@@ -43,6 +43,8 @@ def image_and_mask(frame: Frame) -> tuple[UInt8[np.ndarray, "H W 3"], Bool[np.nd
     return frame.image.cpu().numpy(), None if frame.mask is None else frame.mask.cpu().numpy()
 
 
+#: Clip limit of the local contrast enhancement (CLAHE) of the grey image, on 8 x 8 tiles.
+_CLIP_LIMIT = 4.0
 #: Extracts the features of an RGB image where its mask, if any, is True.
 Extractor = Callable[[UInt8[np.ndarray, "H W 3"], Bool[np.ndarray, "H W"] | None], Features]
 
@@ -61,11 +63,10 @@ def feature_extractor(settings: FeatureSettings) -> Extractor:
     options.sift.max_num_features = settings.max_features
     options.sift.upright = settings.upright
     sift = pycolmap.FeatureExtractor.create(options, pycolmap.Device.cpu)
-    local_contrast = cv2.createCLAHE(settings.local_contrast, (8, 8)) if settings.local_contrast else None
+    local_contrast = cv2.createCLAHE(_CLIP_LIMIT, (8, 8))
 
     def extract(image: np.ndarray, mask: np.ndarray | None) -> Features:
-        gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
-        gray = gray if local_contrast is None else local_contrast.apply(gray)
+        gray = local_contrast.apply(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
         keypoints, descriptors = sift.extract_from_uint8_array(np.ascontiguousarray(gray))
         points = pycolmap.keypoints_to_matrix(keypoints).astype(np.float32).reshape(-1, 4)
         vectors = np.asarray(descriptors.data, np.float32).reshape(-1, 128)
@@ -124,12 +125,14 @@ def quiet_colmap(seed: int) -> Iterator[None]:
 Pairs = UInt32[np.ndarray, "M 2"]
 Matches = Mapping[tuple[int, int], Pairs]
 
+#: Largest distance of the descriptors of matching features, 0 to 2.
+_MAX_DISTANCE = 0.7
 #: Features closer than this are duplicates and do not count as the second-best match of each other. Pixels.
 _DUPLICATE_DISTANCE = 2.0
 
 
-def mutual_matches(first: Features, second: Features, max_ratio: float, max_distance: float) -> Pairs:
-    """Match features by mutual nearest descriptors, Lowe's ratio test and a limit of their distance, 0 to 2."""
+def mutual_matches(first: Features, second: Features, max_ratio: float = 0.8) -> Pairs:
+    """Match features by mutual nearest descriptors, Lowe's ratio test and a limit of their distance."""
     if min(len(first), len(second)) < 2:
         return np.empty((0, 2), np.uint32)
     similarity = first.descriptors @ second.descriptors.T
@@ -148,7 +151,7 @@ def mutual_matches(first: Features, second: Features, max_ratio: float, max_dist
     similarity[(is_duplicate + is_duplicate.T)[partners].nonzero()] = -1.0
     products = best, similarity.max(axis=1, initial=-1.0)
     distance, second_best = (np.sqrt(np.maximum(2.0 - 2.0 * product, 0.0)) for product in products)
-    is_match = (distance < max_distance) & (distance < max_ratio * second_best)
+    is_match = (distance < _MAX_DISTANCE) & (distance < max_ratio * second_best)
     return np.stack([rows[is_match], partners[is_match]], axis=1).astype(np.uint32)
 
 
@@ -265,7 +268,7 @@ def alike_pairs(
     largest = [Features(each.keypoints[row], each.descriptors[row]) for each, row in zip(features, rows, strict=True)]
 
     def alikeness(first: int, second: int) -> int:
-        return len(mutual_matches(largest[first], largest[second], settings.max_ratio, settings.max_distance))
+        return len(mutual_matches(largest[first], largest[second], settings.max_ratio))
 
     pairs = {(first, first + step) for step in (1, 2) for first in range(count - step)}
     reached = []

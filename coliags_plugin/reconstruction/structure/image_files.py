@@ -47,7 +47,6 @@ def list_images(folder: Path) -> list[Path]:
 
 @cache
 def _warn_of_unread(folder: Path, count: int, example: str) -> None:
-    """Log a warning, once, of images in formats that are not read."""
     log.warning("%s: %d images are not read, as %s: convert them", folder, count, example)
 
 

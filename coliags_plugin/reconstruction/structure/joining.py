@@ -145,8 +145,6 @@ class _Sighting:
 
 
 class _Comparison:
-    """Comparison of frames of different models of a video."""
-
     def __init__(self, video: MatchedVideo, settings: SfmSettings, masks: Masks) -> None:
         self.video, self.seed = video, settings.seed
         self.finder = PointFinder(settings.tracks)

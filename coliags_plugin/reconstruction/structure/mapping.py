@@ -16,12 +16,11 @@ if TYPE_CHECKING:
     import pycolmap
 
 
-#: RANSAC inlier threshold of the two-view geometry of any two frames that tracks link, pixels.
-_MAX_PAIR_ERROR = 2.0
+#: RANSAC inlier thresholds of the two-view geometry by features, and of any two frames that tracks link, pixels.
+MAX_PAIR_ERROR, _MAX_TRACK_ERROR = 4.0, 2.0
 
 
 def _verify_pairs(database: Path, max_error: float, seed: int) -> None:
-    """Verify the matches of all pairs by their two-view geometry."""
     import pycolmap
 
     views = pycolmap.TwoViewGeometryOptions()
@@ -41,7 +40,7 @@ def map_tracks(database: Path, scratch: Path, settings: SfmSettings) -> list[pyc
     """
     import pycolmap
 
-    _verify_pairs(database, _MAX_PAIR_ERROR, settings.seed)
+    _verify_pairs(database, _MAX_TRACK_ERROR, settings.seed)
     options = pycolmap.GlobalPipelineOptions()
     options.min_model_size = settings.min_model_size
     mapper = options.mapper
@@ -68,7 +67,7 @@ def map_images(
     """
     import pycolmap
 
-    _verify_pairs(database, settings.max_error, settings.seed)
+    _verify_pairs(database, MAX_PAIR_ERROR, settings.seed)
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads = options.mapper.num_threads = 1
     options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = settings.seed

@@ -137,6 +137,21 @@ def _patches(texture: np.ndarray, at: np.ndarray) -> Float32[np.ndarray, "K 121"
     return np.concatenate(parts)
 
 
+#: Least strength of a new corner, relative to the strongest, and its least distance from other points, pixels.
+_QUALITY, _SPACING = 0.004, 6
+#: Largest distance between a point and where following it back ends, pixels; least normalised cross-correlation of 11 x
+#: 11 pixels around a point, and that from which it is clearly found.
+_MAX_RETURN, _MIN_CORRELATION, _CLEAR = 0.7, 0.6, 0.8
+#: RANSAC inlier threshold of the epipolar geometry of neighbours, pixels.
+_MAX_ERROR = 2.5
+#: Where fewer points survive, those lost are searched for again; number of frames in which they are.
+_BRIDGE_BELOW, _LONGEST_BRIDGE = 150, 4
+#: Least share of the points found again that satisfy one epipolar geometry.
+_LEAST_SHARE = 0.5
+#: Fewest points that are followed.
+_FEWEST = 20
+
+
 @dataclass(frozen=True, eq=False)
 class FramePoints:
     """Tracked points of one frame."""
@@ -166,7 +181,7 @@ def track_between(
     Masks are False where a pixel is ignored; pixel centres are at integers + 0.5. Points that are lost on the way are
     not searched for again.
     """
-    tracker = PointTracker((settings or TrackSettings()).model_copy(update={"bridge_below": 0}))
+    tracker = PointTracker(settings or TrackSettings(), bridge_below=0)
     frames = [tracker.advance(image, mask) for image, mask in zip(images, masks, strict=True)]
     rows = shared_tracks(frames[0], frames[-1]).T
     first, last = (
@@ -187,7 +202,7 @@ def track_points(
     points = []
     for path in with_progress(images, "track points", progress):
         points.append(forward.advance(read_image(path), mask_of(path, masks)))
-    stretches = _around([frame.followed for frame in points], settings)
+    stretches = _around([frame.followed for frame in points])
     next_id = forward.next_id
     for stretch in with_progress(stretches, "track backwards", progress):
         backward = PointTracker(settings, next_id)
@@ -203,11 +218,11 @@ def track_points(
     return points
 
 
-def _around(followed: Sequence[int], settings: TrackSettings) -> list[range]:
+def _around(followed: Sequence[int]) -> list[range]:
     """Stretches of frames around those in which few tracks survive."""
     near = np.zeros(len(followed), bool)
     for index, count in enumerate(followed):
-        if index and count < settings.bridge_below:
+        if index and count < _BRIDGE_BELOW:
             near[max(0, index - 2 * _LONGEST_BRIDGE) : index + 2 * _LONGEST_BRIDGE] = True
     edges = np.flatnonzero(np.diff(np.concatenate([[0], near, [0]])))
     return [range(first, end) for first, end in edges.reshape(-1, 2).tolist()]
@@ -294,8 +309,8 @@ class PointFinder:
 class PointTracker:
     """Point tracker with the last view, and the views before frames in which most points were lost."""
 
-    def __init__(self, settings: TrackSettings, first_id: int = 0) -> None:
-        self.settings = settings
+    def __init__(self, settings: TrackSettings, first_id: int = 0, bridge_below: int = _BRIDGE_BELOW) -> None:
+        self.settings, self.bridge_below = settings, bridge_below
         self.finder = PointFinder(settings)
         self.last: View | None = None
         self.bridges: list[View] = []
@@ -318,7 +333,7 @@ class PointTracker:
                 lost = bridge.only(~np.isin(bridge.ids, view.ids))
                 again, places = self._followed(lost, view)
                 view = view.with_points(lost.ids[again], places)
-            if len(rows) < self.settings.bridge_below:
+            if len(rows) < self.bridge_below:
                 self.bridges.append(self.last)
         view = _without_collisions(view)
         followed = len(view.ids)
@@ -342,7 +357,6 @@ class PointTracker:
         return alike[consistent], moved[consistent]
 
     def _with_corners(self, view: View) -> View:
-        """The view with new points where there are few."""
         import cv2
 
         missing = self.settings.corners - len(view.ids)
@@ -350,8 +364,8 @@ class PointTracker:
             return view
         free = view.usable.astype(np.uint8)
         for column, row in np.rint(view.pixels).astype(int).tolist():
-            cv2.circle(free, (column, row), self.settings.spacing, 0, -1)
-        corners = cv2.goodFeaturesToTrack(view.detail, missing, _QUALITY, self.settings.spacing, mask=free, blockSize=7)
+            cv2.circle(free, (column, row), _SPACING, 0, -1)
+        corners = cv2.goodFeaturesToTrack(view.detail, missing, _QUALITY, _SPACING, mask=free, blockSize=7)
         if corners is None:
             return view
         ids = np.arange(self.next_id, self.next_id + len(corners))
@@ -399,18 +413,3 @@ def _sampled(flow: Float32[np.ndarray, "h w 2"], pixels: Float32[np.ndarray, "K 
 
     channels = [cv2.remap(flow[..., k], pixels[:, 0], pixels[:, 1], cv2.INTER_LINEAR).ravel() for k in (0, 1)]
     return np.stack(channels, axis=1)
-
-
-#: Least strength of a new corner, relative to the strongest.
-_QUALITY = 0.004
-#: Largest distance between a point and where following it back ends, pixels; least normalised cross-correlation of 11 x
-#: 11 pixels around a point, and that from which it is clearly found.
-_MAX_RETURN, _MIN_CORRELATION, _CLEAR = 0.7, 0.6, 0.8
-#: RANSAC inlier threshold of the epipolar geometry of neighbours, pixels.
-_MAX_ERROR = 2.5
-#: Number of frames in which lost points are searched for.
-_LONGEST_BRIDGE = 4
-#: Least share of the points found again that satisfy one epipolar geometry.
-_LEAST_SHARE = 0.5
-#: Fewest points that are followed.
-_FEWEST = 20

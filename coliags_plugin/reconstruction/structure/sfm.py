@@ -325,7 +325,6 @@ _NOTHING, _BLURRED = 15, 0.5
 
 
 def _reason(video: MatchedVideo, index: int) -> str:
-    """Why an image has no pose."""
     if not video.tracks:
         return "too few matches with images that have a pose"
     around = [frame.sharpness for frame in video.tracks[max(0, index - 10) : index + 11]]

@@ -23,12 +23,6 @@ if TYPE_CHECKING:
 class FeatureSettings(Settings):
     """Options of SIFT extraction. COLMAP's defaults find about a hundred points on a colon's wall."""
 
-    local_contrast: float = Field(
-        default=4.0,
-        ge=0.0,
-        description="Clip limit of CLAHE (contrast-limited adaptive histogram equalisation) of the grey image, on "
-        "8 x 8 tiles; 0: none.",
-    )
     peak_threshold: float = Field(
         default=0.001, gt=0.0, description="SIFT peak (contrast) threshold. COLMAP's default is 0.0067."
     )
@@ -99,12 +93,6 @@ class TrackSettings(Settings):
         default=384, ge=64, description="Larger side of the images that are tracked, pixels; larger ones are reduced."
     )
     corners: int = Field(default=1400, ge=100, description="Number of points followed, topped up in every frame.")
-    spacing: int = Field(default=6, ge=2, description="Least distance of a new corner from other points, pixels.")
-    bridge_below: int = Field(
-        default=150,
-        ge=0,
-        description="Where fewer points survive, those lost are searched for again in the next frames; 0: never.",
-    )
     longest_window: int = Field(
         default=400,
         ge=8,
@@ -138,12 +126,6 @@ class SfmSettings(Settings):
         description="Images further apart than two are matched if at least this many of their largest features match.",
     )
     max_ratio: float = Field(default=0.8, gt=0.0, le=1.0, description="Largest ratio in Lowe's ratio test.")
-    max_distance: float = Field(
-        default=0.7, gt=0.0, le=2.0, description="Largest L2 distance between matched unit-length descriptors."
-    )
-    max_error: float = Field(
-        default=4.0, gt=0.0, description="RANSAC inlier threshold of two-view geometric verification, pixels."
-    )
     min_model_size: int = Field(default=3, ge=2, description="Least number of registered images of a model.")
     search_images: int = Field(
         default=24,

@@ -28,7 +28,7 @@ from coliags_plugin.reconstruction.structure.features import (
     mutual_matches,
 )
 from coliags_plugin.reconstruction.structure.image_files import Masks, file_names, is_repeated, mask_of, read_image
-from coliags_plugin.reconstruction.structure.mapping import brightness_at, map_images, map_tracks
+from coliags_plugin.reconstruction.structure.mapping import MAX_PAIR_ERROR, brightness_at, map_images, map_tracks
 from coliags_plugin.reconstruction.structure.point_tracks import FramePoints, sharpness, track_points
 from coliags_plugin.reconstruction.structure.sfm_settings import (
     Picture,
@@ -194,11 +194,11 @@ def _needs_tracks(
     strong = []
     for first in np.unique(np.linspace(0, len(sizes) - 2, _COMPARED).round().astype(int)).tolist():
         pair = [features_of(images[row])[0] for row in (first, first + 1)]
-        matches = mutual_matches(pair[0], pair[1], settings.max_ratio, settings.max_distance)
+        matches = mutual_matches(pair[0], pair[1], settings.max_ratio)
         pixels_first, pixels_second = (
             features.pixels[rows] - 0.5 for features, rows in zip(pair, matches.T, strict=True)
         )
-        inliers = epipolar_inliers(pixels_first, pixels_second, sizes[first][::-1], settings.max_error)
+        inliers = epipolar_inliers(pixels_first, pixels_second, sizes[first][::-1], MAX_PAIR_ERROR)
         strong.append(int(inliers.sum()) >= _PLENTY)
     log.info("%d of %d pairs of neighbouring images have plenty of features in common", sum(strong), len(strong))
     return float(np.mean(strong)) < _MOST
@@ -258,7 +258,7 @@ def _with_features(
     )
     pairs = alike_pairs(features, settings, progress)
     matches = {
-        (first, second): mutual_matches(features[first], features[second], settings.max_ratio, settings.max_distance)
+        (first, second): mutual_matches(features[first], features[second], settings.max_ratio)
         for first, second in with_progress(pairs, "match features", progress)
     }
     keypoints = tuple(image_features.keypoints for image_features in features)

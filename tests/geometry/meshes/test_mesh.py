@@ -37,8 +37,7 @@ def test_areas_normals_centers_and_the_border_of_edges_of_one_triangle():
 
 def test_a_part_keeps_places_and_colours_of_its_triangles_only():
     part = TWO.part(np.array([False, True]))
-    assert len(part) == 1
-    assert len(part.vertices) == 3
+    assert len(part) == 1 and len(part.vertices) == 3
     assert part.vertices[part.triangles] == pytest.approx(TWO.vertices[TWO.triangles[[1]]])
     assert np.array_equal(part.colors[part.triangles], TWO.colors[TWO.triangles[[1]]])
 
@@ -54,8 +53,7 @@ def squares(*edges: float) -> TriangleMesh:
 def test_small_parts_are_removed_by_area():
     mesh = squares(1, 10, 2)
     assert np.allclose(mesh.without_small_parts(0.02).areas, [50, 50, 2, 2])
-    assert len(mesh.without_small_parts(0.05)) == 2
-    assert len(mesh.without_small_parts(0.0)) == 6
+    assert len(mesh.without_small_parts(0.05)) == 2 and len(mesh.without_small_parts(0.0)) == 6
     assert len(mesh.part(np.zeros(6, bool)).without_small_parts(0.5)) == 0
 
 
@@ -111,8 +109,7 @@ def test_polygons_negative_indices_and_colours_up_to_1_or_255_of_obj(colors, tmp
     corners = "".join(f"v {place} {colors}\n" for place in ("0 0 0", "1 0 0", "1 1 0", "0 1 0"))
     (tmp_path / "m.obj").write_text(f"# a square\n{corners}vn 0 0 1\nf -4//1 -3//1 -2//1 -1//1\n")
     mesh = read_mesh(tmp_path / "m.obj")
-    assert mesh.triangles.tolist() == [[0, 1, 2], [0, 2, 3]]
-    assert mesh.colors.tolist() == [[255, 0, 128]] * 4
+    assert mesh.triangles.tolist() == [[0, 1, 2], [0, 2, 3]] and mesh.colors.tolist() == [[255, 0, 128]] * 4
 
 
 @pytest.mark.parametrize(("kind", "top"), [("u1", 255), ("u2", 65535), ("f4", 1)])
@@ -214,8 +211,7 @@ def test_a_shifted_plane():
         assert (direction.mean, direction.median, direction.percentile_95) == pytest.approx((0.75,) * 3, abs=1e-5)
     assert (compared.chamfer, compared.hausdorff_95) == pytest.approx((0.75, 0.75), abs=1e-5)
     assert [score.f for score in compared.scores] == [0.0, 1.0, 1.0]  # nothing within 0.5 mm
-    assert compared.normal_error == pytest.approx(0.0, abs=0.1)
-    assert compared.beyond_seen == 0.0
+    assert compared.normal_error == pytest.approx(0.0, abs=0.1) and compared.beyond_seen == 0.0
     assert compared.seen_area == pytest.approx(1600.0)
 
 

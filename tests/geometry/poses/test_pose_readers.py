@@ -178,22 +178,6 @@ def test_frames_are_ordered_as_people_count(tmp_path):
     assert any("order of their names" in remark for remark in read.remarks)
 
 
-@given(seed=st.integers(0, 1000), scale=st.floats(0.01, 100))
-@settings(max_examples=10, deadline=None)
-def test_nerfstudios_change_of_the_world_is_undone(tmp_path_factory, seed, scale):
-    applied = some_transform(seed)
-    matrices = [some_transform(seed + 1), some_transform(seed + 2)]
-    stored = [applied @ matrix for matrix in matrices]
-    for matrix in stored:
-        matrix[:3, 3] *= scale
-    path = tmp_path_factory.mktemp("nerf") / "t.json"
-    transforms(path, stored, applied_transform=applied[:3].tolist(), applied_scale=scale)
-    changed, plain = (nerfstudio.read(path), nerfstudio.read(transforms(path.with_name("plain.json"), matrices)))
-    np.testing.assert_allclose(changed.camera_to_world, plain.camera_to_world, atol=1e-9)
-    assert any("applied_transform" in remark for remark in changed.remarks)
-    assert not plain.remarks[:-1]
-
-
 PINHOLE = {"fl_x": 100.0, "fl_y": 90.0, "cx": 31.0, "cy": 25.0, "w": 64, "h": 48}
 
 

@@ -89,8 +89,7 @@ def test_a_wall(wall, estimated):
         errors.append(np.abs(frame.depth.numpy() / wall_depth(true_frame.camera) - 1.0))
         sure.append(confidence_of(estimated, frame.name))
     error, confidence = np.stack(errors), np.stack(sure)
-    assert np.median(error) < 0.01
-    assert np.percentile(error[confidence > 0.8], 90) < 0.03
+    assert np.median(error) < 0.01 and np.percentile(error[confidence > 0.8], 90) < 0.03
     assert (confidence > 0.8).mean() > 0.7
     assert (error[confidence > 0.8] < 0.05).mean() > 0.9
 
@@ -120,8 +119,7 @@ def test_what_a_split_holds_out_is_recorded_where_depth_was_made_from_it(estimat
     def used(folder, split):
         return open_scene(folder, options=[f"split={split}"]).provenance.held_out_used
 
-    assert used(estimated, "every-8th") == {}
-    assert used(estimated, "all-train") == {}
+    assert used(estimated, "every-8th") == {} and used(estimated, "all-train") == {}
     assert used(estimated, "endogslam") == {"depth": ["0007_color"]}
     older = shutil.copytree(estimated, tmp_path / "older")
     content = json.loads((older / "transforms.json").read_text())
@@ -216,8 +214,7 @@ def test_unit_mask_and_own_split_are_kept(estimated, tmp_path):
     assert len(scene.points) > 50
     for frame in scene.train:
         np.testing.assert_array_equal(frame.mask, mask)
-        assert np.isnan(frame.depth.numpy()[~mask]).all()
-        assert np.isfinite(frame.depth.numpy()[mask]).all()
+        assert np.isnan(frame.depth.numpy()[~mask]).all() and np.isfinite(frame.depth.numpy()[mask]).all()
         assert (confidence_of(out, frame.name)[~mask] == 0.0).all()
     assert max((confidence_of(out, frame.name)[mask] > 0.5).mean() for frame in scene.train) > 0.4
 

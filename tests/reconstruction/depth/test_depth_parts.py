@@ -161,8 +161,7 @@ def test_a_swept_surface_is_smooth_up_to_the_edges_of_the_image():
     rough = truth * np.exp(np.random.default_rng(0).normal(0.0, 0.02, truth.shape))
     smooth = smooth_surface(rough.astype(np.float32), np.where(columns < 48, 0.5, -0.5).astype(np.float32))
     error = np.abs(np.log(smooth / truth))
-    assert np.median(error) < 0.005
-    assert error[:, 47:49].max() < 0.05
+    assert np.median(error) < 0.005 and error[:, 47:49].max() < 0.05
     # Depth of half the size is brought to the image's.
     half = smooth_surface(np.full((40, 48), 7.0, np.float32), np.zeros((80, 96), np.float32))
     np.testing.assert_allclose(half, np.full((80, 96), 7.0), rtol=1e-4)
@@ -171,8 +170,7 @@ def test_a_swept_surface_is_smooth_up_to_the_edges_of_the_image():
 def test_the_rim_is_the_near_side_of_an_edge():
     log_depth = np.where(np.arange(96) < 50, 3.0, 3.5).astype(np.float32)[None].repeat(80, axis=0)
     rim = near_rim(log_depth, 6)
-    assert rim[40, 45:50].all()
-    assert not rim[:, 50:].any()
+    assert rim[40, 45:50].all() and not rim[:, 50:].any()
     assert not rim[:, :40].any()
     assert not near_rim(np.full((80, 96), 3.0, np.float32), 6).any()
 
@@ -363,12 +361,10 @@ def swept(sweep, base_of):
 def test_a_plane_seen_by_cameras_at_known_places():
     sweep = Sweep(step=0.02)
     factors = ratios(sweep, (20.0, 80.0))
-    assert factors[0] == 1.0
-    assert factors[-1] == pytest.approx(4.0)
+    assert factors[0] == 1.0 and factors[-1] == pytest.approx(4.0)
     result, truth = swept(sweep, lambda truth: np.full(truth.shape, 20.0))
     error = np.abs(result.depth / truth - 1.0)[INNER]
-    assert np.median(error) < 0.01
-    assert np.percentile(error, 90) < 0.03
+    assert np.median(error) < 0.01 and np.percentile(error, 90) < 0.03
     assert np.median(result.match[INNER]) > 0.98
 
 
@@ -416,5 +412,4 @@ def test_fusion_repairs_a_wrong_depth():
     fused = fuse_frame(maps[2], [maps[k] for k in (0, 1, 3, 4)], 0.02)
     inner = (slice(8, -8), slice(12, -12))
     np.testing.assert_allclose(fused.depth[inner], truth[inner], rtol=3e-3)
-    assert fused.votes[20, 45] == 5.0
-    assert fused.votes[35, 45] == 4.0
+    assert fused.votes[20, 45] == 5.0 and fused.votes[35, 45] == 4.0
