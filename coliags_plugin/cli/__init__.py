@@ -7,15 +7,22 @@ import os
 import re
 import sys
 from collections.abc import Sequence
-from typing import Annotated, Any, Union
+from typing import Annotated, Any, Protocol, Union
 
 import tyro
 
 from coliags_plugin.cli import comparing, methods, poses, reconstruct, runs, scenes
-from coliags_plugin.cli.arguments import Runnable, hint, in_flags, translate_for
+from coliags_plugin.cli.texts import in_flags, translate_for
 from coliags_plugin.core import __version__
 from coliags_plugin.core.errors import ReportedError
-from coliags_plugin.core.libraries import separate_stderr
+
+
+class Runnable(Protocol):
+    """Protocol of a parsed command."""
+
+    def run(self) -> None:
+        """Execute the command."""
+
 
 #: Commands by their names, in the order of the help.
 COMMANDS: dict[str, type[Runnable]] = {
@@ -47,8 +54,6 @@ Command: Any = Union[tuple(Annotated[kind, tyro.conf.subcommand(name)] for name,
 
 #: A word, or the value after ``--option=``, that begins with ``~``. Settings are expanded where they are used.
 _HOME = re.compile(r"((?:--[\w-]+=)?)(~[^=]*)")
-#: Exit status for arguments that cannot be parsed.
-_USAGE_ERROR = 2
 DESCRIPTION = (
     "Gaussian splatting for colonoscopy: training, evaluation and comparison of reconstruction methods. "
     "--version prints the version."
@@ -61,8 +66,6 @@ def main(argv: Sequence[str] | None = None) -> None:
     # decoding took up to 2000 ms instead of 40. A short spin keeps the speed of an idle machine and loses little on a
     # busy one. It is read when torch is first imported.
     os.environ.setdefault("GOMP_SPINCOUNT", "10000")
-    if argv is None:
-        separate_stderr()
     # The shell leaves a ~ that is quoted or comes after "=", as in --data=~/scene.
     arguments = sys.argv[1:] if argv is None else argv
     words = [f[1] + os.path.expanduser(f[2]) if (f := _HOME.fullmatch(word)) else word for word in arguments]
@@ -73,10 +76,6 @@ def main(argv: Sequence[str] | None = None) -> None:
         command = tyro.cli(
             Command, prog="coliags", description=DESCRIPTION, args=words, config=(tyro.conf.FlagCreatePairsOff,)
         )
-    except SystemExit as refused:
-        if refused.code == _USAGE_ERROR and (correction := hint(words, COMMANDS)):
-            print(f"coliags: {correction}", file=sys.stderr)
-        raise
     except BrokenPipeError:  # the reader of the help has closed the pipe, as `head` does
         sys.stderr.close()
         sys.exit(1)

@@ -6,12 +6,11 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from coliags_plugin.cli import arguments
-from coliags_plugin.cli.summaries import coliags, print_summary
+from coliags_plugin.cli.texts import coliags, print_summary
 from coliags_plugin.config import options
 
 if TYPE_CHECKING:
@@ -95,9 +94,11 @@ class ReportCommand(options.ReportOptions):
 
 
 @dataclass(frozen=True)
-class ResultsShowCommand:
+class ResultsCommand:
     """Show results: what was run, means of the metrics, and what it cost."""
 
+    action: tyro.conf.Positional[Literal["show"]]
+    """Action."""
     path: tyro.conf.Positional[Path]
     """Results file, or a run folder, or a folder to search for results files."""
     json: options.AsJson = False
@@ -115,41 +116,3 @@ class ResultsShowCommand:
             blocks += [result.table(), FactList([Fact(name, text) for name, text in texts.items()])]
             summaries.append({**means_summary(result), "facts": texts})
         print_summary(terminal_text(blocks), {"results": summaries}, as_json=self.json)
-
-
-@dataclass(frozen=True)
-class ResultsExportCommand:
-    """Export results as a long CSV table of every frame's metrics."""
-
-    paths: tyro.conf.Positional[tuple[Path, ...]]
-    """Results files, run folders, or folders to search for results files."""
-    output: options.Output
-    """File to write."""
-    json: options.AsJson = False
-
-    def run(self) -> None:
-        """Write the table."""
-        from coliags_plugin.core.errors import InputError
-        from coliags_plugin.results.reading import find_results, write_csv
-
-        if not self.paths:
-            raise InputError("no results to export", "at least one file or folder")
-        results = find_results(self.paths)
-        if self.output.is_dir():
-            raise InputError(f"--output {self.output} is a folder", "a file to write, such as table.csv")
-        write_csv(self.output, results)
-        print_summary(written=[self.output.resolve()], as_json=self.json)
-
-
-Subcommand = (
-    Annotated[ResultsShowCommand, tyro.conf.subcommand("show")]
-    | Annotated[ResultsExportCommand, tyro.conf.subcommand("export")]
-)
-
-
-@dataclass(frozen=True)
-class ResultsCommand(arguments.CommandGroup):
-    """Show results files, and export them as tables."""
-
-    subcommand: tyro.conf.OmitArgPrefixes[tyro.conf.OmitSubcommandPrefixes[Subcommand]]
-    """Subcommand."""

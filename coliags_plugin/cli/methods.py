@@ -14,8 +14,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from coliags_plugin.cli.arguments import in_flags
-from coliags_plugin.cli.summaries import print_summary
+from coliags_plugin.cli.texts import in_flags, print_summary
 from coliags_plugin.config import options
 
 

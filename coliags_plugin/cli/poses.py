@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from coliags_plugin.cli import arguments
-from coliags_plugin.cli.summaries import depth_commands, print_summary
+from coliags_plugin.cli.texts import depth_commands, parse_size, print_summary
 from coliags_plugin.config import options
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.files import refuse_existing, refuse_overlap
 
 if TYPE_CHECKING:
     from coliags_plugin.core.intrinsics import Intrinsics
@@ -66,7 +66,8 @@ class PosesSfmCommand:
         from coliags_plugin.reconstruction.structure.sfm import millimetres, reconstruct, scaled
         from coliags_plugin.reconstruction.structure.sfm_settings import SfmSettings
 
-        arguments.refuse_output(self.output, self.frames, self.overwrite)
+        refuse_overlap(self.output, self.frames)
+        refuse_existing(self.output, self.overwrite)
         if self.every < 1 or (self.max_frames is not None and self.max_frames < 2):
             raise InputError(f"--every {self.every}, --max-frames {self.max_frames}", "1 or more, and 2 or more")
         known_distance = self._known_distance()
@@ -147,7 +148,7 @@ def parse_intrinsics(intrinsics: str | None, size: str | None) -> Intrinsics | N
     except ValueError as error:
         raise InputError(f"--intrinsics {intrinsics}", "four numbers fx,fy,cx,cy in pixels") from error
     with prefixed_errors("--intrinsics, --size"):
-        return Intrinsics(fx, fy, cx, cy, *arguments.parse_size(size))
+        return Intrinsics(fx, fy, cx, cy, *parse_size(size))
 
 
 @dataclass(frozen=True)
@@ -327,8 +328,12 @@ Subcommand = (
 
 
 @dataclass(frozen=True)
-class PosesCommand(arguments.CommandGroup):
+class PosesCommand:
     """Convert, compare and export camera poses, or estimate them from images."""
 
     subcommand: tyro.conf.OmitArgPrefixes[tyro.conf.OmitSubcommandPrefixes[Subcommand]]
     """Subcommand."""
+
+    def run(self) -> None:
+        """Execute the subcommand."""
+        self.subcommand.run()

@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from coliags_plugin.cli import arguments
-from coliags_plugin.cli.summaries import coliags, print_summary, view_command
+from coliags_plugin.cli.texts import coliags, parse_size, print_summary, view_command
 from coliags_plugin.config import options
 from coliags_plugin.core.errors import InputError
 
@@ -67,7 +66,7 @@ class ReconstructCommand(options.ReconstructOptions):
             else parse_assignments([f"params=[{self.params}]"])["params"],
             "diameter": self.diameter,
             **self._frames(),
-            "size": None if self.size is None else arguments.parse_size(self.size),
+            "size": None if self.size is None else parse_size(self.size),
             "method": self.method,
             "steps": self.steps,
         }

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from coliags_plugin.cli.summaries import coliags, print_summary, view_command
+from coliags_plugin.cli.texts import coliags, print_summary, view_command
 from coliags_plugin.config import options
 from coliags_plugin.core.errors import InputError
 

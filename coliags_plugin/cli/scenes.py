@@ -11,8 +11,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from coliags_plugin.cli import arguments
-from coliags_plugin.cli.summaries import ESTIMATED_DEPTH_METHOD, print_summary, train_command
+from coliags_plugin.cli.texts import ESTIMATED_DEPTH_METHOD, parse_size, print_summary, train_command
 from coliags_plugin.config import options
 
 
@@ -60,9 +59,9 @@ class PhantomCommand:
         options: dict[str, Any] = {"seed": self.seed, "layout": self.layout, "overwrite": self.overwrite}
         options |= {name: value for name, value in values.items() if value is not None}
         if self.size is not None:
-            options["width"], options["height"] = arguments.parse_size(self.size)
+            options["width"], options["height"] = parse_size(self.size)
         if self.light_offset is not None:
-            options["light_offset"] = arguments.parse_vector("--light-offset", self.light_offset)
+            options |= parse_assignments([f"light_offset=[{self.light_offset}]"])
         options |= parse_assignments(self.set)
         folder = make_phantom(self.output, **options)
         print_summary(facts={"settings": options}, written=[folder], then=[train_command(folder)], as_json=self.json)
@@ -141,21 +140,26 @@ class DepthCommand:
 
     def run(self) -> None:
         """Estimate, or resume; write the scene and print a summary."""
+        from coliags_plugin.config.assignments import settings_of
         from coliags_plugin.core.errors import InputError
+        from coliags_plugin.core.files import refuse_existing, refuse_overlap
         from coliags_plugin.engine.data_formats import open_scene
         from coliags_plugin.engine.progress import progress_callback
         from coliags_plugin.reconstruction.depth.scene import estimate_scene, training_options
         from coliags_plugin.reconstruction.depth.sweeping import DepthEstimationSettings
 
-        arguments.refuse_output(self.output, self.scene, self.overwrite)
+        refuse_overlap(self.output, self.scene)
+        refuse_existing(self.output, self.overwrite)
         if (self.near is None) != (self.far is None):
             raise InputError("--near without --far, or the reverse", "both or neither")
         if self.jobs is not None and self.jobs < 1:
             raise InputError(f"--jobs {self.jobs}", "a number of threads of 1 or more")
-        settings, options = arguments.settings_among(DepthEstimationSettings, self.set, "depth.")
+        depth_settings = [item.removeprefix("depth.") for item in self.set if item.startswith("depth.")]
+        settings = settings_of(DepthEstimationSettings, depth_settings, "depth.")
         with progress_callback() as progress:
             # Images are read when they are needed, so that memory does not grow with the video.
-            reading = ["initial_points=none", "keep_pixels=false", *options]
+            of_manager = [item for item in self.set if not item.startswith("depth.")]
+            reading = ["initial_points=none", "keep_pixels=false", *of_manager]
             scene = open_scene(self.scene, self.data_format, reading, progress)
             near_far = None if self.near is None or self.far is None else (self.near, self.far)
             estimated = estimate_scene(

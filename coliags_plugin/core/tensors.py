@@ -2,12 +2,7 @@
 
 from __future__ import annotations
 
-import os
-import shutil
-import sysconfig
-from functools import cache, lru_cache
-from importlib.util import find_spec
-from pathlib import Path
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -17,6 +12,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.libraries import what_triton_lacks
 
 #: Multiplier of the position in the sequence, and the two of the mixing, of splitmix64; as signed integers.
 _GOLDEN, _MIX = 0x9E3779B97F4A7C15 - 2**64, (0xBF58476D1CE4E5B9 - 2**64, 0x94D049BB133111EB - 2**64)
@@ -24,8 +20,6 @@ _GOLDEN, _MIX = 0x9E3779B97F4A7C15 - 2**64, (0xBF58476D1CE4E5B9 - 2**64, 0x94D04
 _CHUNK = 4096
 #: A wall's normal is estimated from one in so many of the points, and from no fewer than so many.
 _SHARE, _FEWEST = 500, 20
-#: The oldest release of triton that all kernels compile with; PyTorch 2.11 brings it.
-OLDEST = (3, 6)
 
 
 def constant(values: tuple[Any, ...], like: Tensor) -> Tensor:
@@ -181,27 +175,6 @@ def wall_normals(points: Float[Tensor, "P 3"], at: Float[Tensor, "N 3"]) -> Floa
     millimetres.
     """
     return point_normals(points, min(len(points), max(_FEWEST, len(points) // _SHARE)), at)
-
-
-@cache
-def what_triton_lacks() -> str | None:
-    """Why triton cannot launch kernels on this machine, and what to do; None where it can.
-
-    At first use it compiles the C code that calls the driver.
-    """
-    if find_spec("triton") is None:
-        return "triton is not installed; PyTorch for CUDA on Linux brings it"
-    import triton
-
-    if tuple(int(part) for part in triton.__version__.split(".")[:2]) < OLDEST:
-        return f"triton {triton.__version__} is older than {'.'.join(map(str, OLDEST))}, which PyTorch 2.11 brings"
-    if os.environ.get("CC") is None and shutil.which("gcc") is None and shutil.which("clang") is None:
-        return "triton finds no C compiler to call the driver by: install gcc, or name one in CC"
-    scheme = sysconfig.get_default_scheme()
-    header = Path(sysconfig.get_paths("posix_prefix" if scheme == "posix_local" else scheme)["include"], "Python.h")
-    if not header.is_file():
-        return f"triton needs {header}, the headers of Python: install python3-dev or the like"
-    return None
 
 
 def fit_kernels(*tensors: Tensor) -> bool:

@@ -10,8 +10,8 @@ import torch
 from coliags_plugin.contracts import Availability
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.gaussians import Gaussians
+from coliags_plugin.core.libraries import what_triton_lacks
 from coliags_plugin.core.render_output import RenderOutput
-from coliags_plugin.core.tensors import what_triton_lacks
 from coliags_plugin.renderers.splatting import CutSettings, SplattingRenderer, check_device, check_float32
 from coliags_plugin.renderers.stages import Stages, draw_view
 from coliags_plugin.renderers.tiles import TileGrid

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.files import atomic_write, write_json
+from coliags_plugin.core.files import write_json
 from coliags_plugin.core.json_files import read_json
 from coliags_plugin.core.settings import invalid_reported
 from coliags_plugin.reporting.numbers import Direction, duration
@@ -100,13 +100,6 @@ def _files(path: Path) -> list[Path]:
             f"{path} holds no results", "results files, as `coliags eval` writes them", "Run `coliags eval RUN` first"
         )
     return matches
-
-
-#: Columns of the long table: one row per run, test set, frame and metric.
-VALUE_COLUMNS = (
-    *("key", "method", "scene", "split", "seed", "protocol", "protocol_version"),
-    *("set", "frame", "metric", "value", "unit"),
-)
 
 
 def means_summary(result: Result) -> dict[str, Any]:
@@ -198,18 +191,3 @@ def frame_rows(result: Result, metrics: Iterable[str]) -> Iterator[list[Any]]:
 def per_frame_table(result: Result) -> str:
     """Content of ``per_frame.csv``: one line per frame and one column per metric, empty where a frame has none."""
     return csv_text(["set", "frame", *result.metrics], frame_rows(result, result.metrics))
-
-
-def value_rows(result: Result) -> Iterator[tuple[Any, ...]]:
-    """Rows of :data:`VALUE_COLUMNS`, one for each value of each frame; None where the frame has none."""
-    run = (result.key, result.method, result.scene.name, result.scene.split, result.seed)
-    protocol = (result.protocol.name, result.protocol.version)
-    for set_name, part in result.sets.items():
-        for metric, values in part.values.items():
-            for frame, value in zip(part.frames, values, strict=True):
-                yield (*run, *protocol, set_name, frame, metric, value, result.metrics[metric].unit)
-
-
-def write_csv(path: Path, results: Sequence[Result]) -> None:
-    """Write the values of results as CSV, with all their digits, missing ones empty."""
-    atomic_write(path, csv_text(VALUE_COLUMNS, (row for result in results for row in value_rows(result))))

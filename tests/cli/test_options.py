@@ -14,10 +14,9 @@ import pytest
 import tyro
 
 import coliags_plugin as cp
-from coliags_plugin.cli import COMMANDS
-from coliags_plugin.cli.arguments import hint, in_flags, subcommands, translate_for
+from coliags_plugin.cli import COMMANDS, poses
 from coliags_plugin.cli.comparing import CompareCommand
-from coliags_plugin.cli.summaries import print_summary
+from coliags_plugin.cli.texts import in_flags, print_summary, translate_for
 from coliags_plugin.config.options import TrainOptions, takes
 from coliags_plugin.core import __version__
 from tests.commands import run
@@ -61,8 +60,8 @@ NAMES |= {"settings": "set", "formats": "format"}
 
 def commands() -> dict[str, type]:
     """Every command by the name of its class."""
-    kinds = [inner for kind in COMMANDS.values() for inner in subcommands(kind).values() or [kind]]
-    return {kind.__name__: kind for kind in kinds}
+    parts = [kind for kind, _ in map(typing.get_args, typing.get_args(poses.Subcommand))]
+    return {kind.__name__: kind for kind in (*COMMANDS.values(), *parts) if kind is not poses.PosesCommand}
 
 
 @pytest.mark.parametrize("kind", commands().values(), ids=commands())
@@ -90,27 +89,6 @@ def test_a_summary_for_people_and_for_scripts(capsys):
     assert json.loads(capsys.readouterr().out) == {"step": 3, "written": ["a b"], "next": ["coliags eval 'a b'"]}
     print_summary("text", as_json=True)
     assert json.loads(capsys.readouterr().out) == {"summary": "text", "written": [], "next": []}
-
-
-@pytest.mark.parametrize(
-    ("argv", "meant"),
-    [
-        ("trian coliags --data SCENE", "train"),
-        ("poses sfn FRAMES", "sfm"),
-        ("train coliags --data SCENE --stepz=5", "--steps"),
-        ("render RUN --no-vido", "--no-video"),
-        ("weights lpips --form FOLDER", "--from"),
-        ("data check SCENE --htm page.html", "--html"),
-    ],
-)
-def test_the_nearest_command_or_option_is_named(argv, meant, capsys):
-    assert run(*argv.split()) == 2
-    assert capsys.readouterr().err.splitlines()[-1] == f"coliags: Did you mean '{meant}'?"
-
-
-def test_nothing_is_suggested_where_nothing_is_near():
-    for argv in ("", "xylophone", "train coliags", "train coliags --zzzzzz", "poses"):
-        assert hint(argv.split(), COMMANDS) == ""
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.ndimage import map_coordinates
 
-from coliags_plugin.core import tensors
+from coliags_plugin.core import libraries
 from coliags_plugin.core.arrays import dilated, eroded
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.intrinsics import Intrinsics
@@ -201,10 +201,10 @@ def test_constants_and_what_is_sent_stay_on_the_device():
 
 @pytest.fixture
 def lacks(monkeypatch):
-    monkeypatch.setattr(tensors, "find_spec", lambda name: object())
+    monkeypatch.setattr(libraries, "find_spec", lambda name: object())
     monkeypatch.setitem(sys.modules, "triton", SimpleNamespace(__version__="3.10.0"))
     monkeypatch.delenv("CC", raising=False)
-    return tensors.what_triton_lacks.__wrapped__
+    return libraries.what_triton_lacks.__wrapped__
 
 
 def test_what_triton_lacks_is_said(lacks, monkeypatch, tmp_path):
@@ -218,5 +218,5 @@ def test_what_triton_lacks_is_said(lacks, monkeypatch, tmp_path):
     assert "headers of Python" in lacks()
     monkeypatch.setitem(sys.modules, "triton", SimpleNamespace(__version__="3.5.1"))
     assert "triton 3.5.1 is older than 3.6" in lacks()
-    monkeypatch.setattr(tensors, "find_spec", lambda name: None)
+    monkeypatch.setattr(libraries, "find_spec", lambda name: None)
     assert "triton is not installed" in lacks()

@@ -1,8 +1,7 @@
-"""Results files: what is read is what was written, and nothing else is read; finding and exporting them."""
+"""Results files: what is read is what was written, and nothing else is read; finding them."""
 
 from __future__ import annotations
 
-import csv
 import hashlib
 import json
 import math
@@ -17,13 +16,10 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.results import hashing
 from coliags_plugin.results.hashing import ArraysHash, code_key, metrics_sha256, result_key
 from coliags_plugin.results.reading import (
-    VALUE_COLUMNS,
     find_results,
     means_summary,
     per_frame_table,
     read_result,
-    value_rows,
-    write_csv,
     write_result,
 )
 from coliags_plugin.results.record import VERSION, CostRecord, ProfileRecord, ProtocolRecord, Result
@@ -263,21 +259,14 @@ def test_a_result_has_means_and_is_shown_in_one_line_and_as_a_table():
     assert result._repr_html_() == table._repr_html_()
 
 
-ROTATION = made_set(("r",), (0.1 + 0.2,), (1e-300,))
-
-
-def other_run(**changes):
-    """Result of another method, under another protocol, with two test sets."""
-    facts = {"key": "f" * 16, "method": "ablations/none", "protocol": ProtocolRecord(name="mine", version=3)}
-    return made_result({"test": made_set(), "rotation": ROTATION}, **{**facts, **changes})
-
-
 @pytest.fixture
 def runs(tmp_path):
     """A folder of a run folder, of a plain results file, and of much else."""
     folder = tmp_path / "runs"
     write_result(folder / "one/eval/paper/result.json", made_result())
-    write_result(folder / "others/any name.json", other_run())
+    sets = {"test": made_set(), "rotation": made_set(("r",), (20.0,), (1.0,))}
+    other = made_result(sets, key="f" * 16, method="ablations/none", protocol=ProtocolRecord(name="mine", version=3))
+    write_result(folder / "others/any name.json", other)
     (folder / "one/eval/paper/metrics.json").write_text('{"psnr": 30}')
     (folder / "one/state.json").write_text("{")
     (folder / "one/binary.json").write_bytes(bytes(range(256)))
@@ -322,23 +311,6 @@ def test_an_unreadable_file_is_named(runs):
         find_results([runs])
 
 
-# Tables
-
-
-def test_csv_has_a_row_for_every_value_with_every_digit(tmp_path):
-    expected = [row for result in (made_result(), other_run()) for row in value_rows(result)]
-    assert len(expected) == 6 + 3 * 2 + 3 * 1
-    case = ("f" * 16, "ablations/none", "wall", "every-8th", 0, "mine", 3)
-    assert expected[6] == (*case, "test", "0000", "psnr", 30.0, "dB")
-    assert expected[-1] == (*case, "rotation", "r", "depth_mse", 1e-300, "mm^2")
-    write_csv(tmp_path / "table.csv", [made_result(), other_run()])
-    with (tmp_path / "table.csv").open(newline="") as file:
-        head, *read = csv.reader(file)
-    assert tuple(head) == VALUE_COLUMNS
-    assert [float(row[10]) if row[10] else None for row in read] == [row[10] for row in expected]
-    assert read == [["" if value is None else str(value) for value in row] for row in expected]
-
-
 # Commands
 
 
@@ -349,14 +321,5 @@ def test_show_prints_means_and_costs(runs, capsys):
         assert part in printed
     assert "processor time" not in printed, "it was not measured"
     assert run("results", "show", runs) == 0
-
-
-def test_export_writes_csv_and_refuses_what_cannot_be_written(runs, tmp_path, capsys):
-    assert run("results", "export", runs, "--output", tmp_path / "new/table.csv") == 0
-    assert len((tmp_path / "new/table.csv").read_text().splitlines()) == 1 + 6 + 9
-    (tmp_path / "folder.csv").mkdir()
-    assert "is a folder" in refused(capsys, "results", "export", runs, "--output", tmp_path / "folder.csv")
-    under_a_file = runs / "one/state.json/table.csv"
-    assert "cannot write" in refused(capsys, "results", "export", runs, "--output", under_a_file)
-    assert "no results to export" in refused(capsys, "results", "export", "--output", tmp_path / "t.csv")
-    assert "holds no results" in refused(capsys, "results", "show", tmp_path / "folder.csv")
+    (runs.parent / "empty").mkdir()
+    assert "holds no results" in refused(capsys, "results", "show", runs.parent / "empty")

@@ -15,7 +15,6 @@ from typing_extensions import override
 
 from coliags_plugin.core.arrays import read_array
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.libraries import decoder_messages
 from coliags_plugin.core.scene_files import required_file
 from coliags_plugin.core.text_files import unreadable
 from coliags_plugin.datamanagers.reading.images import read_gray
@@ -140,7 +139,6 @@ def read_exr_channel(path: Path, channel: str, do: str) -> Float32[np.ndarray, "
         with (
             _ALONE,
             redirect_stdout(io.StringIO()),  # OpenEXR prints warnings
-            decoder_messages(),
             OpenEXR.File(str(path), separate_channels=True) as file,
         ):
             # OpenEXR returns no parts for a damaged file.

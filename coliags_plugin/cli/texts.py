@@ -1,17 +1,56 @@
-"""Summaries that commands print at their end: results, files written, and commands to type next."""
+"""Texts of commands: options in messages as flags, sizes, summaries, and commands to type next."""
 
 from __future__ import annotations
 
 import json
+import re
 import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, get_type_hints
 
-from coliags_plugin.cli.arguments import in_flags
+import tyro
+
+from coliags_plugin.core.errors import InputError
 
 #: The method for scenes with estimated depth, as `coliags reconstruct` trains it.
 ESTIMATED_DEPTH_METHOD = "coliags-in-vivo"
+#: An option or setting in a message: `name`, `name=value` or `key.path=value`, in backticks.
+_QUOTED = re.compile(r'`([a-z]\w*(?:\.(?:\w+|"[^"`]*"))*)(?:=([^`]*))?`')
+#: Flags of the running command by names of its options.
+_running: dict[str, str] = {}
+
+
+def translate_for(command: object) -> None:
+    """Let :func:`in_flags` name the flags of a command; positional arguments have none."""
+    _running.clear()
+    hints = get_type_hints(type(getattr(command, "subcommand", command)), include_extras=True)
+    for name, kind in hints.items():
+        metadata = getattr(kind, "__metadata__", ())
+        if tyro.conf.Positional not in metadata:
+            names = [each.name for each in metadata if getattr(each, "name", None)]
+            _running[name] = f"--{names[0] if names else name.replace('_', '-')}"
+
+
+def in_flags(text: str) -> str:
+    """A message with the options that it quotes as flags of the running command, and other settings as ``--set``."""
+
+    def flag(quoted: re.Match[str]) -> str:
+        name, value = quoted.groups()
+        if name not in _running:
+            return quoted[0] if value is None else f"--set {shlex.quote(quoted[0].strip('`'))}"
+        option = _running[name]
+        return option if value in (None, "True") else f"{option} {value}"
+
+    return _QUOTED.sub(flag, text)
+
+
+def parse_size(text: str) -> tuple[int, int]:
+    """``WxH`` -> (width, height), pixels."""
+    width, _, height = text.lower().partition("x")
+    if not (width.isdecimal() and height.isdecimal()):
+        raise InputError(f"--size {text}", "WIDTHxHEIGHT in pixels, for instance 338x270")
+    return int(width), int(height)
 
 
 def print_summary(
