@@ -24,8 +24,7 @@ import tyro
 from machine import CLOCKS, show, size_of
 from tube import tube_scene
 
-from coliags_plugin.config.method_config import LoadedMethod, load_method
-from coliags_plugin.config.method_files import method_files
+from coliags_plugin.config.method_config import LoadedMethod, load_method, method_files
 from coliags_plugin.contracts import GaussianField
 from coliags_plugin.engine.devices import choose_device
 from coliags_plugin.engine.run_folder import RunFolder

@@ -7,9 +7,8 @@ from coliags_plugin.core import __version__
 
 if TYPE_CHECKING:
     from coliags_plugin.api.comparing import ablate, compare, report, variant
-    from coliags_plugin.api.runs import Run, load_run
+    from coliags_plugin.api.runs import Run, import_splats, load_run, train
     from coliags_plugin.api.scenes import load_scene, make_phantom, reconstruct
-    from coliags_plugin.api.training import import_splats, train
 
 __all__ = [
     "Run",
@@ -29,9 +28,8 @@ __all__ = [
 #: Names of the API by its modules.
 _MODULES = {
     "comparing": ("ablate", "compare", "report", "variant"),
-    "runs": ("Run", "load_run"),
+    "runs": ("Run", "import_splats", "load_run", "train"),
     "scenes": ("load_scene", "make_phantom", "reconstruct"),
-    "training": ("import_splats", "train"),
 }
 
 

@@ -33,7 +33,7 @@ def test_a_wheel_has_all_contents_and_finds_its_methods_where_it_is_installed(tm
     assert f"Version: {__version__}" in metadata
     assert "coliags = coliags_plugin.cli:main" in scripts
     assert any(name.endswith("licenses/LICENSE") for name in names)
-    code = "import coliags_plugin.config.method_files as m; print(m.method_folder()); print(*m.method_names())"
+    code = "import coliags_plugin.config.method_config as m; print(m.method_folder()); print(*m.method_files())"
     command = [sys.executable, "-I", "-c", f"import sys; sys.path.insert(0, {str(tmp_path)!r}); {code}"]
     shown = subprocess.run(command, check=True, capture_output=True, text=True, timeout=60).stdout.splitlines()
     assert shown[0] == str(tmp_path / "coliags_plugin" / "method_configs")

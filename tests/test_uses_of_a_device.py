@@ -5,13 +5,13 @@ import pytest
 import torch
 
 import coliags_plugin as cp
-from coliags_plugin.api.training import import_splats
+from coliags_plugin.api.runs import import_splats
 from coliags_plugin.comparison import compare
 from coliags_plugin.comparison.compare import carry_out
 from coliags_plugin.config.options import CompareOptions
 from coliags_plugin.core.images import read_rgb
-from coliags_plugin.engine import pose_refinement
-from coliags_plugin.engine.camera_path import CameraPath, Keyframe
+from coliags_plugin.engine import scoring
+from coliags_plugin.engine.rendering import CameraPath, Keyframe
 from coliags_plugin.export.baking import distillation
 from coliags_plugin.export.splats.formats import WRITERS
 from coliags_plugin.export.viewer.live import Viewer
@@ -43,7 +43,7 @@ def options_of(method):
 def few_steps(monkeypatch):
     """Fits to a run take two steps."""
     monkeypatch.setattr(distillation, "STEPS", 2)
-    monkeypatch.setattr(pose_refinement, "STEPS", 2)
+    monkeypatch.setattr(scoring, "STEPS", 2)
 
 
 @pytest.fixture(scope="module")

@@ -33,7 +33,7 @@ def compare(methods: str | Variant | Sequence[str | Variant], options: CompareOp
             run.
         InterruptedRunError: Ctrl-C; all runs are saved, and the same call goes on with them.
     """
-    from coliags_plugin.api.training import warn_of_suspect_data
+    from coliags_plugin.api.runs import warn_of_suspect_data
     from coliags_plugin.comparison.compare import carry_out
 
     return carry_out(methods, options, warn_of_suspect_data)
@@ -62,7 +62,7 @@ def variant(name: str, method: str, settings: Mapping[str, Any]) -> Variant:
     Args:
         name: In tables and file names.
         method: Name of a method or path of a method config.
-        settings: Changes of the method config, see :func:`~coliags_plugin.api.training.train`.
+        settings: Changes of the method config, see :func:`~coliags_plugin.api.runs.train`.
 
     Raises:
         InputError: These are no settings.

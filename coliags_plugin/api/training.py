@@ -36,7 +36,7 @@ def train(options: TrainOptions, *, view_port: int | None = None) -> Run:
     """
     from coliags_plugin.engine.devices import choose_device
     from coliags_plugin.engine.loggers import find_loggers
-    from coliags_plugin.engine.training import IfExists, open_training
+    from coliags_plugin.engine.trainer import IfExists, open_training
 
     if options.resume and options.overwrite:
         raise InputError("`resume=True` and `overwrite=True` together", "one of them")

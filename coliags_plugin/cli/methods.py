@@ -29,7 +29,7 @@ class ListCommand:
     def run(self) -> None:
         """Print names by kind, with the source of those that are not built in."""
         from coliags_plugin.comparison.named_files import ABLATIONS, shipped
-        from coliags_plugin.config.method_files import descriptions, method_files
+        from coliags_plugin.config.method_config import descriptions, method_files
         from coliags_plugin.config.registry import REGISTRIES
         from coliags_plugin.core.errors import check_name
 

@@ -25,7 +25,7 @@ class TrainCommand(options.TrainOptions):
 
     def run(self) -> None:
         """Train, and print the run folder."""
-        from coliags_plugin.api.training import train
+        from coliags_plugin.api.runs import train
 
         run = train(self, view_port=self.port if self.view else None)
         facts = {"method": run.method, "scene": run.scene_name, "seed": run.seed, "step": run.step}
@@ -40,7 +40,7 @@ class ImportCommand(options.ImportOptions):
 
     def run(self) -> None:
         """Import, and print the run folder."""
-        from coliags_plugin.api.training import import_splats
+        from coliags_plugin.api.runs import import_splats
 
         run = import_splats(self)
         print_summary(written=[run.path], then=[coliags("eval", run.path)], as_json=self.json)

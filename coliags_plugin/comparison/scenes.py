@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from coliags_plugin.comparison.named_files import load_benchmark, shipped
-from coliags_plugin.config.method_files import is_path
+from coliags_plugin.config.method_config import is_path
 from coliags_plugin.config.registry import phantom_layouts
 from coliags_plugin.core.errors import InputError, check_name, did_you_mean
 from coliags_plugin.core.files import user_path

@@ -72,7 +72,7 @@ class CellTask(Task):
 
         from coliags_plugin.config.options import TrainOptions
         from coliags_plugin.engine.checkpoints import keep_newest, take_newest
-        from coliags_plugin.engine.training import open_training
+        from coliags_plugin.engine.trainer import open_training
 
         threads = self.threads
         if run.config_file.is_file():

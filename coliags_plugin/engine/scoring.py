@@ -1,28 +1,32 @@
-"""Scores of views under a protocol: of single ones, and those of a test set."""
+"""Scores of held-out views under a protocol, error profiles of a test set, and views from refined poses."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from itertools import product
 from typing import Any
 
+import numpy as np
 import torch
-from jaxtyping import Float
-from torch import Tensor
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+from torch.nn import functional
 
 from coliags_plugin.config import registry
 from coliags_plugin.config.components import named_component
 from coliags_plugin.contracts import Comparison, Metric, Protocol
+from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError, UnavailableError
 from coliags_plugin.core.render_output import BLANK_ALPHA, OPAQUE_ALPHA, RenderOutput
 from coliags_plugin.core.scenes import Frame
+from coliags_plugin.core.tensors import masked_mean
+from coliags_plugin.datamanagers.shots import fitted
 from coliags_plugin.engine.model import Model
-from coliags_plugin.engine.pose_refinement import color_factors, refined_camera
 from coliags_plugin.results.hashing import ArraysHash
-from coliags_plugin.results.profiles import ErrorProfiles
-from coliags_plugin.results.record import REFINED_METRICS, REFINED_SUFFIXES, SEEN_SUFFIX, SetRecord
+from coliags_plugin.results.record import REFINED_METRICS, REFINED_SUFFIXES, SEEN_SUFFIX, ProfileRecord, SetRecord
 
 
 @dataclass(frozen=True)
@@ -192,3 +196,161 @@ def within_seen(comparison: Comparison, frame: Frame) -> Comparison:
     mask = frame.seen.to(comparison.valid.device)
     depth_valid = None if comparison.depth_valid is None else comparison.depth_valid & mask
     return replace(comparison, valid=comparison.valid & mask, depth_valid=depth_valid)
+
+
+#: Adam steps on each view; the first and last of their lengths, in pixels of the image that is rendered in them.
+STEPS, FIRST_STEP, LAST_STEP = 40, 0.5, 0.05
+#: Size that this image is within, pixels.
+_WITHIN = (192, 192)
+
+
+def refined_camera(model: Model, frame: Frame) -> Camera:
+    """The camera of a held-out frame at the pose that fits its image best, found by gradients through a frozen model.
+
+    Adam on the mean absolute difference over the valid pixels of a reduced image, from the frame's pose, after each
+    colour was multiplied by its best factor, so that a wrong exposure moves no pose; view modules act as they do on the
+    frame. The camera turns about the median rendered depth on its axis. The pose of least difference along the way is
+    returned; that given where nothing opaque is in view.
+
+    Args:
+        model: On the frame's device.
+        frame: Held out.
+    """
+    camera, view = _reduced(frame.camera), frame.view(trained=False)
+    image, valid = _area_mean(frame.rgb, camera), _area_mean(frame.valid[..., None].float(), camera)[..., 0] == 1.0
+    with torch.no_grad():
+        output = model.render(camera, ("rgb", "alpha", "depth_expected"), view)
+    opaque = output.alpha >= OPAQUE_ALPHA
+    if not opaque.any():
+        return frame.camera
+    depth = float(output["depth_expected"][opaque].median())
+    pixel = 1.0 / (camera.fx * camera.fy) ** 0.5  # radians, and in depths
+    motion = torch.zeros(6, device=image.device, requires_grad=True)  # rotation and translation, pixels
+    optimizer = torch.optim.Adam([motion], lr=FIRST_STEP)
+    decay = torch.optim.lr_scheduler.ExponentialLR(optimizer, (LAST_STEP / FIRST_STEP) ** (1.0 / STEPS))
+    least, best = torch.inf, motion.detach()
+    with _frozen(model):
+        for _ in range(STEPS):
+            turn, shift = pixel * motion[:3], pixel * depth * motion[3:]
+            rgb = model.render(camera.moved(turn, shift, depth), ("rgb", "alpha"), view).rgb
+            error = masked_mean((rgb * color_factors(rgb, image, valid) - image).abs(), valid)
+            if error.item() < least:
+                least, best = error.item(), motion.detach().clone()
+            optimizer.zero_grad()
+            torch.autograd.backward(error)
+            optimizer.step()
+            decay.step()
+    return frame.camera.moved(pixel * best[:3], pixel * depth * best[3:], depth)
+
+
+@contextmanager
+def _frozen(model: nn.Module) -> Iterator[None]:
+    """Without gradients of the parameters."""
+    learned = [parameter for parameter in model.parameters() if parameter.requires_grad]
+    for parameter in learned:
+        parameter.requires_grad_(False)
+    try:
+        yield
+    finally:
+        for parameter in learned:
+            parameter.requires_grad_(True)
+
+
+def _reduced(camera: Camera) -> Camera:
+    return camera.resized(*fitted(camera.width, camera.height, _WITHIN))
+
+
+def _area_mean(values: Float[Tensor, "H W C"], camera: Camera) -> Float[Tensor, "h w C"]:
+    """An image at the size of a camera."""
+    small = functional.interpolate(values.permute(2, 0, 1)[None], (camera.height, camera.width), mode="area")
+    return small[0].permute(1, 2, 0)
+
+
+@torch.no_grad()
+def color_factors(
+    rgb: Float[Tensor, "H W 3"], true: Float[Tensor, "H W 3"], valid: Bool[Tensor, "H W"]
+) -> Float[Tensor, "3"]:
+    """The factor on each colour of least squared difference over the valid pixels."""
+    rendered = rgb[valid]
+    return (rendered * true[valid]).sum(0) / rendered.square().sum(0).clamp_min(1e-12)
+
+
+#: Distance from the camera's centre along the pixel's ray, scene units (mm).
+DISTANCE_EDGES = (0.0, 5.0, 10.0, 15.0, 20.0, 30.0, 40.0, 60.0, 80.0, 100.0, 150.0, 200.0, 300.0)
+#: Angle of the pixel's ray to the optical axis, degrees.
+ANGLE_EDGES = tuple(float(angle) for angle in range(0, 95, 5))
+
+
+class ErrorProfiles:
+    """Sums of squared errors over the pixels of many frames whose true depth is known, in bins with fixed edges.
+
+    A pixel counts if the frame's own true depth is finite and the protocol compares both its colour and its depth. Its
+    distance is that of the true surface, in ``unit``; pixels beyond the last edge are left out. Edges times ``scale``
+    are :data:`DISTANCE_EDGES`.
+    """
+
+    def __init__(self, unit: str = "mm", scale: float = 1.0) -> None:
+        self._distance = _Bins(unit, tuple(edge / scale for edge in DISTANCE_EDGES))
+        self._angle = _Bins("degrees", ANGLE_EDGES)
+        self._frames = 0
+
+    def add(self, comparison: Comparison, frame: Frame) -> None:
+        """Add the pixels of a frame; none where it has no true depth."""
+        if frame.depth is None or comparison.depth is None or comparison.true_depth is None:
+            return
+        depth, compared = _float64(frame.depth), comparison.valid
+        if comparison.depth_valid is not None:
+            compared = compared & comparison.depth_valid
+        counts = np.isfinite(depth) & compared.cpu().numpy()
+        tangents = _tangents(frame.camera)
+        rgb = np.square(_float64(comparison.rgb) - _float64(comparison.true_rgb)).mean(axis=-1)
+        z = np.square(_float64(comparison.depth) - _float64(comparison.true_depth))
+        self._distance.add((depth * np.hypot(1.0, tangents))[counts], rgb[counts], z[counts])
+        self._angle.add(np.degrees(np.arctan(tangents))[counts], rgb[counts], z[counts])
+        self._frames += 1
+
+    def records(self) -> dict[str, ProfileRecord]:
+        """Profiles over distance and angle; empty where no frame had true depth."""
+        return {"distance": self._distance.record(), "angle": self._angle.record()} if self._frames else {}
+
+
+class _Bins:
+    def __init__(self, unit: str, edges: tuple[float, ...]) -> None:
+        self.unit, self.edges = unit, edges
+        self.pixels = np.zeros(len(edges) - 1, dtype=np.int64)
+        self.rgb, self.depth = np.zeros(len(edges) - 1), np.zeros(len(edges) - 1)
+
+    def add(self, where: Float[np.ndarray, "P"], rgb: Float[np.ndarray, "P"], depth: Float[np.ndarray, "P"]) -> None:
+        """Add squared errors of pixels; a bin holds its lower edge."""
+        index = np.searchsorted(self.edges, where, side="right") - 1
+        inside = (index >= 0) & (index < len(self.pixels))
+        index, bins = index[inside], len(self.pixels)
+        self.pixels += np.bincount(index, minlength=bins)
+        self.rgb += np.bincount(index, rgb[inside], bins)
+        self.depth += np.bincount(index, depth[inside], bins)
+
+    def record(self) -> ProfileRecord:
+        """Means per bin."""
+        return ProfileRecord(
+            unit=self.unit,
+            edges=self.edges,
+            pixels=tuple(self.pixels.tolist()),
+            rgb_mse=self._means(self.rgb),
+            depth_mse=self._means(self.depth),
+        )
+
+    def _means(self, sums: Float[np.ndarray, "B"]) -> tuple[float | None, ...]:
+        return tuple(
+            float(total / count) if count and np.isfinite(total) else None
+            for total, count in zip(sums, self.pixels, strict=True)
+        )
+
+
+def _tangents(camera: Camera) -> Float[np.ndarray, "H W"]:
+    """Tangent of the angle between each pixel's ray and the optical axis. [H, W]"""
+    rays = Camera.of(camera.intrinsics, torch.eye(4, dtype=torch.float64)).rays()
+    return np.linalg.norm(rays[..., :2].numpy(), axis=-1)
+
+
+def _float64(values: Tensor) -> Float[np.ndarray, "..."]:
+    return values.detach().cpu().double().numpy()

@@ -332,7 +332,7 @@ def train(context: StageContext) -> StageRecord:
     """Train, or go on from the newest checkpoint."""
     from coliags_plugin.config.options import TrainOptions
     from coliags_plugin.engine.run_folder import RunFolder
-    from coliags_plugin.engine.training import open_training
+    from coliags_plugin.engine.trainer import open_training
     from coliags_plugin.reconstruction.depth.scene import training_options
 
     settings = context.settings

@@ -18,10 +18,10 @@ from coliags_plugin.results.record import SetRecord
 _IGNORED = ("description", "protocol")
 #: Keys within its data manager, of what it allows to be read, and within its schedule, likewise.
 _IGNORED_WITHIN = {"datamanager": ("outside_files",), "schedule": ("log_every", "checkpoint_every")}
-#: Code that determines training and evaluation: all packages that the engine imports but presentation, and profiles.
+#: Code that determines training and evaluation: all packages that the engine imports but presentation.
 _CODE = (
     *("core", "config", "contracts", "geometry", "datamanagers", "fields", "renderers", "modules"),
-    *("strategies", "losses", "metrics", "engine", "results/profiles.py"),
+    *("strategies", "losses", "metrics", "engine"),
 )
 
 
@@ -77,8 +77,7 @@ def training_config(config: Mapping[str, Any]) -> dict[str, Any]:
 def code_files() -> dict[str, Path]:
     """Source files that determine training and evaluation, by their places within the package, sorted."""
     package = Path(__file__).parents[1]
-    roots = [package / name for name in _CODE]
-    files = [file for root in roots for file in ([root] if root.is_file() else root.rglob("*.py"))]
+    files = [file for name in _CODE for file in (package / name).rglob("*.py")]
     return dict(sorted((file.relative_to(package).as_posix(), file) for file in files))
 
 

@@ -16,8 +16,7 @@ from typing import Any
 
 import yaml
 
-from coliags_plugin.config.method_config import MethodConfig, load_method
-from coliags_plugin.config.method_files import method_files
+from coliags_plugin.config.method_config import MethodConfig, load_method, method_files
 from coliags_plugin.config.yaml_tree import Node, read_tree
 
 HEAD = """\

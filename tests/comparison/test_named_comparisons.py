@@ -11,8 +11,7 @@ import pytest
 
 from coliags_plugin.comparison.named_files import ABLATIONS, load_ablation, load_benchmark, shipped
 from coliags_plugin.comparison.scenes import find_scenes
-from coliags_plugin.config.method_config import load_method
-from coliags_plugin.config.method_files import descriptions
+from coliags_plugin.config.method_config import descriptions, load_method
 from coliags_plugin.core.errors import InputError
 
 

@@ -15,8 +15,7 @@ from hypothesis import strategies as st
 
 from coliags_plugin.config import registry
 from coliags_plugin.config.assignments import assignments, parse_assignments
-from coliags_plugin.config.method_config import load_method
-from coliags_plugin.config.method_files import descriptions, method_files, method_folder, method_names
+from coliags_plugin.config.method_config import descriptions, load_method, method_files, method_folder
 from coliags_plugin.config.yaml_tree import parse_tree, parse_value
 from coliags_plugin.core.errors import InputError
 
@@ -32,9 +31,9 @@ def method_file(tmp_path):
 
 
 def test_every_shipped_method_is_described_and_benchmarks_are_none():
-    assert all(descriptions(method_files()).values()) and "ablations/none" in method_names()
+    assert all(descriptions(method_files()).values()) and "ablations/none" in method_files()
     assert list((method_folder() / "benchmarks").glob("*.yaml"))
-    assert not [name for name in method_names() if "benchmarks" in name]
+    assert not [name for name in method_files() if "benchmarks" in name]
 
 
 def test_scaffold_and_coliags_differ_in_heads_only():

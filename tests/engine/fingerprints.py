@@ -22,8 +22,7 @@ from pathlib import Path
 
 from safetensors.torch import load_file
 
-from coliags_plugin.config.method_config import load_method
-from coliags_plugin.config.method_files import method_names
+from coliags_plugin.config.method_config import load_method, method_files
 
 STEPS = 60
 #: Few pixels, few anchors, and growth from the first steps on.
@@ -84,7 +83,7 @@ def main() -> None:
     parser.add_argument("--data", type=Path, required=True)
     parser.add_argument("--sparse", type=Path, required=True)
     parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--methods", nargs="*", default=method_names())
+    parser.add_argument("--methods", nargs="*", default=sorted(method_files()))
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--compare", type=Path)
     options = parser.parse_args()

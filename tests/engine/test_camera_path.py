@@ -15,7 +15,7 @@ import coliags_plugin as cp
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.gaussians import rotation_matrices
-from coliags_plugin.engine.camera_path import CameraPath, Keyframe
+from coliags_plugin.engine.rendering import CameraPath, Keyframe
 from tests.commands import refused, run
 from tests.scenes import SMALL, write_wall
 

@@ -20,10 +20,9 @@ from coliags_plugin.core.scenes import SparseDepth
 from coliags_plugin.engine import trained as trained_module
 from coliags_plugin.engine.checkpoints import checkpoint_folder
 from coliags_plugin.engine.devices import device_name
-from coliags_plugin.engine.evaluator import evaluate
+from coliags_plugin.engine.evaluator import evaluate, match_truth
 from coliags_plugin.engine.scoring import EvaluatedSet, Scorer
 from coliags_plugin.engine.trained import load_trained
-from coliags_plugin.engine.truth import match_truth
 from coliags_plugin.metrics.pixels import PSNR
 from coliags_plugin.metrics.protocols import PaperProtocol
 from coliags_plugin.results.hashing import code_key, result_key

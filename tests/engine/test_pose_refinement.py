@@ -12,8 +12,7 @@ from scipy.spatial.transform import Rotation
 from coliags_plugin.core.gaussians import Gaussians
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.engine.model import Model
-from coliags_plugin.engine.pose_refinement import refined_camera
-from coliags_plugin.engine.scoring import Scorer
+from coliags_plugin.engine.scoring import Scorer, refined_camera
 from coliags_plugin.renderers.torch_renderer import TorchRenderer, TorchRendererSettings
 from tests.renderers.test_torch_renderer import FieldOf
 from tests.textured_tube import tube_frames

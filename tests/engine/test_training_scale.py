@@ -14,14 +14,14 @@ from coliags_plugin.core.images import read_rgb
 from coliags_plugin.core.provenance import Provenance
 from coliags_plugin.core.scenes import PointCloud
 from coliags_plugin.engine import trained as trained_module
-from coliags_plugin.engine import training as training_module
+from coliags_plugin.engine import trainer as trainer_module
 from coliags_plugin.engine.data_formats import UNKNOWN_MEDIAN_DEPTH, training_scale
 from coliags_plugin.engine.evaluator import evaluate
 from coliags_plugin.engine.held_light import flatten
 from coliags_plugin.engine.rendering import render_view
 from coliags_plugin.engine.run_folder import RunFolder
 from coliags_plugin.engine.trained import load_trained
-from coliags_plugin.engine.training import open_training
+from coliags_plugin.engine.trainer import open_training
 from coliags_plugin.export.baking import exporting
 from coliags_plugin.export.baking.exporting import export_run, import_run
 from coliags_plugin.export.splats.formats import read_splats, write_splats
@@ -53,7 +53,7 @@ def factor(small):
 def trained_on(scene, path, resumed=False):
     """A short run, loaded."""
     patch = pytest.MonkeyPatch()
-    for module in (training_module, trained_module):
+    for module in (trainer_module, trained_module):
         patch.setattr(module, "load_scene", lambda config, _: scene.with_near_plane(config.near_plane))
     try:
         options = TrainOptions("coliags-plus", path, steps=6, settings=(*TINY, "datamanager.name=c3vd"))

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import open3d
 
-from coliags_plugin.api.training import train
+from coliags_plugin.api.runs import train
 from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.export.splats.formats import READERS, write_splats
 from coliags_plugin.geometry.meshes.mesh import TriangleMesh, read_mesh, write_mesh

@@ -29,10 +29,9 @@ from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.gaussians import rotation_matrices
 from coliags_plugin.core.scenes import Frame
-from coliags_plugin.engine.camera_path import CameraPath, Keyframe
 from coliags_plugin.engine.devices import make_current
 from coliags_plugin.engine.held_light import flatten
-from coliags_plugin.engine.rendering import depth_picture, render_view, sampled_depth_limits
+from coliags_plugin.engine.rendering import CameraPath, Keyframe, depth_picture, render_view, sampled_depth_limits
 from coliags_plugin.engine.trained import TrainedRun, load_newer
 from coliags_plugin.engine.trainer import Trainer
 from coliags_plugin.export.viewer.page import look_distance, mesh_files

@@ -15,9 +15,9 @@ from coliags_plugin.core.files import atomic_folder, write_json
 from coliags_plugin.core.scenes import Frame, Scene
 from coliags_plugin.datamanagers.recorded import portable_name
 from coliags_plugin.engine.data_formats import open_scene
+from coliags_plugin.engine.evaluator import match_truth
 from coliags_plugin.engine.progress import ProgressReport
 from coliags_plugin.engine.trained import TrainedRun
-from coliags_plugin.engine.truth import match_truth
 from coliags_plugin.geometry.meshes.mesh import MESH_FORMATS, Texture, TriangleMesh, write_mesh
 from coliags_plugin.geometry.meshes.truth import (
     SurfaceComparison,

@@ -21,9 +21,8 @@ from coliags_plugin.config.assignments import parse_assignments
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import read_rgb
-from coliags_plugin.engine.camera_path import CameraPath
 from coliags_plugin.engine.held_light import flatten
-from coliags_plugin.engine.rendering import depth_picture, render_view, sampled_depth_limits
+from coliags_plugin.engine.rendering import CameraPath, depth_picture, render_view, sampled_depth_limits
 from coliags_plugin.export.viewer import live
 from coliags_plugin.geometry.meshes.mesh import TriangleMesh, read_mesh, write_mesh
 from coliags_plugin.reporting.image_files import as_array, eight_bit

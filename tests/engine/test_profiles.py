@@ -12,7 +12,7 @@ import torch
 from coliags_plugin.contracts import Comparison
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.scenes import Frame
-from coliags_plugin.results.profiles import ANGLE_EDGES, DISTANCE_EDGES, ErrorProfiles
+from coliags_plugin.engine.scoring import ANGLE_EDGES, DISTANCE_EDGES, ErrorProfiles
 from tests.scenes import camera_at
 
 
