@@ -57,7 +57,7 @@ class TrainedModel(TypingProtocol):
 
 
 class ParameterRows(TypingProtocol):
-    """Adds, removes and resets rows of a field's parameters together with their gradients and Adam's moments.
+    """Adds and removes rows of a field's parameters, and replaces values, together with gradients and Adam's moments.
 
     Parameters are named by their group, which must hold one parameter. [M, ...]
     """
@@ -73,9 +73,6 @@ class ParameterRows(TypingProtocol):
 
     def keep_rows(self, groups: Sequence[str], keep: Bool[Tensor, "M"]) -> None:
         """Keep only the rows of some groups where ``keep`` is True. [M]"""
-
-    def reset_rows(self, group: str, rows: Bool[Tensor, "M"] | None = None) -> None:
-        """Reset Adam's moments of some rows, or of all rows without ``rows``. [M]"""
 
     def replace_values(self, group: str, values: Tensor) -> None:
         """Replace the values of a group and reset their moments. [M, ...]"""

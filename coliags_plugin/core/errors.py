@@ -78,4 +78,5 @@ def check_number(option: str, number: int | None, least: int = 1) -> None:
 def check_name(noun: str, name: str, known: Collection[str]) -> None:
     """Refuse a name that is none of those known."""
     if name not in known:
-        raise InputError(f"no {noun} '{name}'", f"one of {', '.join(known)}", did_you_mean(name, known))
+        expected = f"one of {', '.join(known)}" if known else f"none, as there is no {noun} here"
+        raise InputError(f"no {noun} '{name}'", expected, did_you_mean(name, known))

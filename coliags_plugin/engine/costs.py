@@ -48,33 +48,32 @@ class CostMeter:
     """
 
     def __init__(self, device: torch.device, earlier: TrainingCost | None = None) -> None:
-        self._device = device
-        self._earlier = earlier or TrainingCost(device="", seconds=0.0, processor_seconds=0.0, peak_memory_mib=0.0)
-        self._measured = earlier is not None
+        self._device, self._cost = device, earlier
         self._began: tuple[float, float] | None = None
-        self._spent = (0.0, 0.0)
 
     @contextmanager
     def running(self) -> Iterator[None]:
         """Count what is spent in the block."""
         if self._device.type == "cuda":
             torch.cuda.reset_peak_memory_stats(self._device)
-        self._measured, self._began = True, _clocks()
+        self._began = _clocks()
         try:
             yield
         finally:
-            self._spent, self._began = self._so_far(), None
+            self._cost, self._began = self.cost(), None
 
     @property
     def seconds(self) -> float:
         """Time of the run so far, of which nothing is missing that was measured."""
-        return (self._earlier.seconds or 0.0) + self._so_far()[0]
+        earlier = 0.0 if self._cost is None else self._cost.seconds or 0.0
+        return earlier if self._began is None else earlier + _clocks()[0] - self._began[0]
 
     def cost(self) -> TrainingCost | None:
         """Cost of the run so far; None where nothing was measured."""
-        if not self._measured:
-            return None
-        earlier, (seconds, processor_seconds) = self._earlier, self._so_far()
+        if self._began is None:
+            return self._cost
+        seconds, processor_seconds = (now - then for now, then in zip(_clocks(), self._began, strict=True))
+        earlier = self._cost or TrainingCost(device="", seconds=0.0, processor_seconds=0.0, peak_memory_mib=0.0)
         peak, before = peak_memory_mib(self._device), earlier.peak_memory_mib
         return TrainingCost(
             device=device_name(self._device),
@@ -83,12 +82,6 @@ class CostMeter:
             processor_seconds=(earlier.processor_seconds or 0.0) + processor_seconds,
             peak_memory_mib=None if peak is None or before is None else max(peak, before),
         )
-
-    def _so_far(self) -> tuple[float, float]:
-        if self._began is None:
-            return self._spent
-        now = _clocks()
-        return self._spent[0] + now[0] - self._began[0], self._spent[1] + now[1] - self._began[1]
 
 
 def _clocks() -> tuple[float, float]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -42,8 +41,6 @@ from coliags_plugin.results.record import (
     Result,
     SceneRecord,
 )
-
-logger = logging.getLogger(__name__)
 
 #: Keys of the provenance of a run and of its scene that a result has in another place.
 _LEFT_OUT = ("method", "seed", "steps", "scene", "untrained_views", "fingerprint", "held_out_used")
@@ -91,20 +88,10 @@ def evaluate(trained: TrainedRun, protocol_name: str, other: Scene | None = None
                 progress.update(count)
         _write_depth_pictures(scratch, scene.length_unit)
         result = _result(trained, scorer, evaluated, meter, truth)
-        _warn_of_bounds(trained.model.learned)
         write_result(scratch / RESULT_FILE, result)
         write_json(scratch / "metrics.json", means_summary(result))
         atomic_write(scratch / "per_frame.csv", per_frame_table(result))
     return result
-
-
-def _warn_of_bounds(learned: Mapping[str, Any]) -> None:
-    """Warn of frames whose learned numbers, such as gains, are at their bounds."""
-    for name, numbers in learned.items():
-        frames = numbers.get("at_bound", ())
-        if frames:
-            shown = ", ".join(frames[:6]) + (", ..." if len(frames) > 6 else "")
-            logger.warning("module '%s' is at a bound in %d frames: %s", name, len(frames), shown)
 
 
 def check_evaluable(model: Model, scene: Scene, scorer: Scorer) -> None:

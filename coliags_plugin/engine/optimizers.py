@@ -86,22 +86,16 @@ class Optimizers:
         for name in groups:
             self._change(name, lambda _, old: old[keep])
 
-    def reset_rows(self, group: str, rows: Tensor | None = None) -> None:
-        """Reset the moments of the rows that are True, or of all."""
-        parameter = self._parameter(group)
-        state = self.adam[group].state.get(parameter, {})
-        for key in (_MOMENTUM, _MEAN_SQUARE):
-            if key in state:
-                state[key][slice(None) if rows is None else rows] = 0.0
-
     @torch.no_grad()
     def replace_values(self, group: str, values: Tensor) -> None:
         """Replace the values of a group and reset their moments."""
-        self._parameter(group).copy_(values)
-        self.reset_rows(group)
+        parameter = self._parameter(group)
+        parameter.copy_(values)
+        state = self.adam[group].state.get(parameter, {})
+        for key in {_MOMENTUM, _MEAN_SQUARE} & state.keys():
+            state[key].zero_()
 
     def _parameter(self, group: str) -> nn.Parameter:
-        """The one parameter of a group."""
         (parameter,) = self.adam[group].param_groups[0]["params"]
         return parameter
 

@@ -15,7 +15,7 @@ from torch import Tensor
 from coliags_plugin.config.options import RenderOptions
 from coliags_plugin.config.yaml_tree import dump, tuples
 from coliags_plugin.core.cameras import Camera
-from coliags_plugin.core.errors import InputError, did_you_mean
+from coliags_plugin.core.errors import check_name
 from coliags_plugin.core.files import atomic_folder, atomic_write, write_json
 from coliags_plugin.core.json_files import read_json
 from coliags_plugin.core.render_output import OPAQUE_ALPHA, RenderOutput
@@ -54,7 +54,8 @@ def render_run(trained: TrainedRun, options: RenderOptions) -> Path:
     output = options.output or trained.run.path / ("path" if along else "relit" if trained.relit else "renders")
     chosen = [] if along is not None else choose_frames(trained.scene, options.frames)
     channels = options.channels
-    _check_channels(trained, channels)
+    for channel in channels:
+        check_name("feature channel", channel, sorted(trained.model.field.feature_channels))
     depth = f"depth_{options.depth_kind}"
     wants, unit = ("rgb", "alpha", depth), trained.scene.length_unit
     trained.model.check_outputs(wants, f"depth of kind '{options.depth_kind}'")
@@ -102,23 +103,9 @@ def error_limit_of(trained: TrainedRun) -> float:
 
 def choose_frames(scene: Scene, frames: str) -> list[Frame]:
     """Frames of a scene: ``train``, ``all`` (train and test in video order), or those of a test set by its name."""
-    groups = {"train": scene.train, **scene.test_sets}
-    groups["all"] = scene.video
-    if not groups.get(frames):
-        names = ", ".join(name for name, group in groups.items() if group)
-        raise InputError(f"scene '{scene.name}' has no frames called '{frames}'", f"one of {names}")
+    groups = {"train": scene.train, **scene.test_sets, "all": scene.video}
+    check_name("set of frames", frames, [name for name, group in groups.items() if group])
     return groups[frames]
-
-
-def _check_channels(trained: TrainedRun, channels: Sequence[str]) -> None:
-    names = sorted(trained.model.field.feature_channels)
-    for channel in channels:
-        if channel not in names:
-            raise InputError(
-                f"method '{trained.method}' has no feature channel '{channel}'",
-                f"one of {', '.join(names)}" if names else "a method with feature channels, such as pr-endo",
-                did_you_mean(channel, names),
-            )
 
 
 @torch.no_grad()

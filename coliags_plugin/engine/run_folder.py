@@ -35,8 +35,6 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 FORMAT = 2
-#: Of the end of a training log, more than a row has.
-_TAIL_BYTES = 8192
 
 
 @dataclass(frozen=True)
@@ -259,8 +257,9 @@ class RunFolder:
 
     @property
     def logged_step(self) -> int:
-        """Step of the last whole row of the training log; 0 without one. Reads the end of the file alone."""
-        rows = filter(None, map(_log_row, reversed(_last_lines(self.log_file))))
+        """Step of the last whole row of the training log; 0 without one."""
+        lines = self.log_file.read_text(errors="replace").splitlines() if self.log_file.is_file() else []
+        rows = filter(None, map(_log_row, reversed(lines)))
         return int(next(rows, {"step": 0})["step"])
 
     def log_rows(self, until: float = math.inf) -> list[JsonObject]:
@@ -280,16 +279,6 @@ class RunFolder:
         rows = [{"step": float(row["step"]), **scalars(row)} for row in self.log_rows()]
         names = dict.fromkeys(name for row in rows for name in row)
         return {name.replace("/", "."): np.array([row.get(name, math.nan) for row in rows]) for name in names}
-
-
-def _last_lines(file: Path) -> list[str]:
-    """The last lines of a file; none where it cannot be read."""
-    try:
-        with file.open("rb") as log:
-            log.seek(max(0, log.seek(0, os.SEEK_END) - _TAIL_BYTES))
-            return log.read().decode(errors="replace").splitlines()
-    except OSError:
-        return []
 
 
 def checkpoints_in_order(folder: Path) -> list[Path]:

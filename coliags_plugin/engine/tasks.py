@@ -43,11 +43,6 @@ STOPPING = 45.0
 _PAUSE = 0.1
 
 
-def package_variables() -> dict[str, str]:
-    """Environment variables of this package."""
-    return {name: value for name, value in os.environ.items() if name.startswith("COLIAGS_")}
-
-
 @dataclass(frozen=True)
 class TaskOutcome:
     """End of a worker."""
@@ -84,7 +79,9 @@ class Task(ABC):
     device: str
     log: Path  # file of the worker's messages
     threads: int  # CPU threads for work that begins; what goes on may keep its number
-    variables: Mapping[str, str] = field(default_factory=package_variables)  # for machines without them
+    variables: Mapping[str, str] = field(  # of this package, for machines without them
+        default_factory=lambda: {name: value for name, value in os.environ.items() if name.startswith("COLIAGS_")}
+    )
 
     @abstractmethod
     def complete(self) -> None:

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
-from typing import NamedTuple
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -65,15 +64,34 @@ def common_scenes(methods: Sequence[Mapping[str, Collection[object]]]) -> list[s
 
 @dataclass(frozen=True)
 class PairedTests:
-    """Tests and effect sizes of a lead; positive effects speak for the reference."""
+    """Tests and effect sizes of a lead; positive effects speak for the reference.
+
+    Differences that are equal up to rounding have no standard deviation: no t-test, no Cohen's d, and the mean alone as
+    the interval.
+    """
 
     wilcoxon: float  # two-sided p of the Wilcoxon signed-rank test
     wilcoxon_holm: float  # the same, adjusted for the family of rivals
-    t_test: float | None  # two-sided p of the paired t-test; None where all leads are equal
+    t_test: float | None  # two-sided p of the paired t-test
     t_test_holm: float | None  # the same, adjusted for the family of rivals
     interval: tuple[float, float]  # 95 % t interval of the mean lead
-    cohen_dz: float | None  # None where all leads are equal
+    cohen_dz: float | None  # mean over standard deviation (n - 1)
     rank_biserial: float  # matched-pairs rank-biserial correlation
+
+    @classmethod
+    def of(cls, differences: Differences) -> PairedTests:
+        """Tests of two differences or more as a family of their own.
+
+        Where scenes are few, the t interval covers more than bootstraps do (docs/reports.md 4).
+        """
+        mean, wilcoxon = float(np.mean(differences)), wilcoxon_p(differences)
+        t_test, cohen_dz, interval = None, None, (mean, mean)
+        if float(np.ptp(differences)) > 1e-12 * float(np.max(np.abs(differences))):
+            test = stats.ttest_1samp(differences, 0.0)
+            low, high = test.confidence_interval(0.95)
+            t_test, interval = float(test.pvalue), (float(low), float(high))
+            cohen_dz = mean / float(np.std(differences, ddof=1))
+        return cls(wilcoxon, wilcoxon, t_test, t_test, interval, cohen_dz, rank_biserial(differences))
 
 
 @dataclass(frozen=True)
@@ -110,26 +128,12 @@ def compare_with_rivals(
         for rival, by_scene in means.items()
         if rival != reference
     }
-    samples = {rival: np.array([*each.values()]) for rival, each in leads.items() if len(each) >= FEWEST_SCENES}
-    wilcoxon = {rival: wilcoxon_p(sample) for rival, sample in samples.items()}
-    student = {rival: t_statistics(sample) for rival, sample in samples.items()}
-    t_test = {rival: each.p for rival, each in student.items() if each.p is not None}
-    wilcoxon_holm, t_test_holm = (
-        dict(zip(p_values, holm([*p_values.values()], max(family, len(leads))), strict=True))
-        for p_values in (wilcoxon, t_test)
-    )
-    tests = {
-        rival: PairedTests(
-            wilcoxon[rival],
-            wilcoxon_holm[rival],
-            t_test.get(rival),
-            t_test_holm.get(rival),
-            student[rival].interval,
-            student[rival].cohen_dz,
-            rank_biserial(sample),
-        )
-        for rival, sample in samples.items()
-    }
+    samples = {rival: [*each.values()] for rival, each in leads.items() if len(each) >= FEWEST_SCENES}
+    tests = {rival: PairedTests.of(np.array(sample)) for rival, sample in samples.items()}
+    for name in ("wilcoxon", "t_test"):
+        p_values = {rival: getattr(test, name) for rival, test in tests.items() if getattr(test, name) is not None}
+        for rival, p in zip(p_values, holm([*p_values.values()], max(family, len(leads))), strict=True):
+            tests[rival] = replace(tests[rival], **{f"{name}_holm": p})
     return [
         RivalComparison(
             rival=rival,
@@ -157,27 +161,6 @@ def wilcoxon_p(differences: Differences) -> float:
     return max(float(stats.wilcoxon(nonzero).pvalue), smallest_p(len(nonzero))) if nonzero.size else 1.0
 
 
-class Student(NamedTuple):
-    """Statistics of paired differences by Student's t."""
-
-    p: float | None  # two-sided p of the paired t-test; None where all differences are equal
-    cohen_dz: float | None  # Cohen's d: mean over standard deviation (n - 1); None where all differences are equal
-    interval: tuple[float, float]  # 95 % interval of the mean; the mean alone where all differences are equal
-
-
-def t_statistics(differences: Differences) -> Student:
-    """Student's t of two differences or more; those that are equal up to rounding have no standard deviation.
-
-    Where scenes are few, the interval covers more than bootstraps do (docs/reports.md 4).
-    """
-    mean = float(np.mean(differences))
-    if float(np.ptp(differences)) <= 1e-12 * float(np.max(np.abs(differences))):
-        return Student(None, None, (mean, mean))
-    test = stats.ttest_1samp(differences, 0.0)
-    low, high = test.confidence_interval(0.95)
-    return Student(float(test.pvalue), mean / float(np.std(differences, ddof=1)), (float(low), float(high)))
-
-
 def rank_biserial(differences: Differences) -> float:
     """Matched-pairs rank-biserial correlation: (R+ - R-) / (R+ + R-), of the ranks of the non-zero differences.
 
@@ -189,15 +172,15 @@ def rank_biserial(differences: Differences) -> float:
     return float(np.sum(np.sign(nonzero) * ranks) / np.sum(ranks)) if nonzero.size else 0.0
 
 
-def holm(p_values: Sequence[float], family: int | None = None) -> list[float]:
-    """p-values adjusted by Holm's step-down procedure, in the given order.
+def holm(p_values: Sequence[float], family: int) -> list[float]:
+    """p-values adjusted for the size of their family by Holm's step-down procedure, in the given order.
 
-    They are adjusted for the size of their family, by default their number; those that are not there count as 1.
+    Those of the family that are not there count as 1.
 
     Source: Holm, A simple sequentially rejective multiple test procedure, 1979.
     """
-    order, count = np.argsort(p_values, kind="stable"), len(p_values) if family is None else family
-    stepped = np.minimum(1.0, (count - np.arange(len(p_values))) * np.array(p_values, dtype=np.float64)[order])
+    order = np.argsort(p_values, kind="stable")
+    stepped = np.minimum(1.0, (family - np.arange(len(p_values))) * np.array(p_values, dtype=np.float64)[order])
     adjusted = np.empty(len(p_values))
     adjusted[order] = np.maximum.accumulate(stepped)
     return adjusted.tolist()

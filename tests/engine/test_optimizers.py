@@ -1,4 +1,4 @@
-"""Rates, and rows of parameters that come, go and are reset together with Adam's moments."""
+"""Rates, and rows of parameters that come and go, and values that are replaced, together with Adam's moments."""
 
 from __future__ import annotations
 
@@ -76,17 +76,9 @@ def test_rows_that_stay_keep_everything(stepped):
     assert torch.equal(moments(optimizers, "sizes")["exp_avg"], momentum)
 
 
-def test_reset_rows_forget_their_moments_alone_and_replaced_values_start_anew(stepped):
+def test_replaced_values_start_anew(stepped):
     field, optimizers = stepped
-    values, parameter = field.points.detach().clone(), field.part.sizes
-    others = moments(optimizers, "points")["exp_avg"][[0, 2, 3]].clone()
-    optimizers.reset_rows("points", torch.tensor([False, True, False, False, True]))
-    state = moments(optimizers, "points")
-    assert not state["exp_avg"][[1, 4]].any() and not state["exp_avg_sq"][[1, 4]].any()
-    assert torch.equal(state["exp_avg"][[0, 2, 3]], others)
-    assert torch.equal(field.points.detach(), values)
-    optimizers.reset_rows("points")
-    assert not state["exp_avg"].any()
+    parameter = field.part.sizes
     optimizers.replace_values("sizes", torch.arange(5.0))
     assert field.part.sizes is parameter and parameter.tolist() == [0, 1, 2, 3, 4]
     assert not moments(optimizers, "sizes")["exp_avg"].any() and not moments(optimizers, "sizes")["exp_avg_sq"].any()
@@ -95,7 +87,7 @@ def test_reset_rows_forget_their_moments_alone_and_replaced_values_start_anew(st
 def test_before_the_first_step_there_are_no_moments_to_cut():
     field, optimizers = make()
     optimizers.add_rows({"points": torch.zeros(1, 3)}, torch.tensor([0]))
-    optimizers.reset_rows("sizes")
+    optimizers.replace_values("sizes", torch.arange(5.0))
     optimizers.keep_rows(["points"], torch.arange(6) > 0)
     assert len(field.points) == 5
 

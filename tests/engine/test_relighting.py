@@ -165,16 +165,10 @@ def plus(wall, tmp_path_factory):
     return coliags_plugin.train("coliags-plus", wall, tmp_path_factory.mktemp("light") / "run", steps=4, device="cpu")
 
 
-def test_learned_numbers_are_in_the_metrics_and_gains_at_a_bound_are_said(plus, caplog):
+def test_learned_numbers_are_in_the_metrics(plus):
     learned = plus.evaluate().provenance["learned"]
     assert set(learned) == {"field", "exposure", "response"} and len(learned["field"]["distance_exponent"]) == 3
     assert json.loads((plus.path / "eval" / "paper" / "metrics.json").read_text())["learned"] == learned
-    loaded = coliags_plugin.load_run(plus.path, device="cpu")
-    with torch.no_grad():
-        loaded.load().model.view_modules["exposure"].log_gain[3] = 90.0
-    loaded.evaluate()
-    name = loaded.load().scene.train[3].name
-    assert f"module 'exposure' is at a bound in 1 frames: {name}" in caplog.text
 
 
 def test_the_command_writes_flattened_views(plus, capsys):

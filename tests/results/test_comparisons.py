@@ -10,6 +10,7 @@ from scipy import stats
 from statsmodels.stats.multitest import multipletests
 
 from coliags_plugin.results.comparisons import (
+    PairedTests,
     common_scenes,
     compare_with_rivals,
     holm,
@@ -17,7 +18,6 @@ from coliags_plugin.results.comparisons import (
     scene_means,
     smallest_p,
     spread,
-    t_statistics,
     wilcoxon_p,
 )
 
@@ -106,7 +106,7 @@ differences = st.lists(st.integers(-40, 40).map(lambda k: k / 8), min_size=2, ma
 
 @pytest.mark.parametrize("p_values", [[0.01], [0.04, 0.01, 0.01, 0.9], [0.3, 0.02, 0.0, 1.0, 0.011, 0.02]])
 def test_holm_is_that_of_statsmodels(p_values):
-    assert holm(p_values) == pytest.approx(multipletests(p_values, method="holm")[1].tolist())
+    assert holm(p_values, len(p_values)) == pytest.approx(multipletests(p_values, method="holm")[1].tolist())
 
 
 @pytest.mark.parametrize(
@@ -126,21 +126,22 @@ def test_swap_and_scale(sample, factor):
     assert wilcoxon_p(-sample) == wilcoxon_p(factor * sample) == pytest.approx(wilcoxon_p(sample))
     assert rank_biserial(-sample) == pytest.approx(-rank_biserial(sample))
     assert rank_biserial(factor * sample) == pytest.approx(rank_biserial(sample))
-    (p, size, (low, high)), swapped, scaled = map(t_statistics, (sample, -sample, factor * sample))
+    first, swapped, scaled = map(PairedTests.of, (sample, -sample, factor * sample))
+    low, high = first.interval
     assert swapped.interval == pytest.approx((-high, -low))
     assert scaled.interval == pytest.approx((factor * low, factor * high))
-    if p is None:
-        assert (size, *swapped[:2], *scaled[:2]) == (None,) * 5
-    else:
-        assert (*swapped[:2], *scaled[:2]) == pytest.approx((p, -size, p, size))
+    p, size = first.t_test, first.cohen_dz
+    others = (swapped.t_test, swapped.cohen_dz, scaled.t_test, scaled.cohen_dz)
+    assert others == ((None,) * 4 if p is None else pytest.approx((p, -size, p, size)))
 
 
 def test_effect_sizes_and_the_interval_by_hand():
     sample = np.array([1.0, 2.0, 3.0, -4.0])
     reach = 3.182446 * np.sqrt(29 / 3 / 4)  # the .975 quantile of Student's t with 3 degrees of freedom
-    assert t_statistics(sample).interval == pytest.approx((0.5 - reach, 0.5 + reach))
-    assert t_statistics(sample).cohen_dz == pytest.approx(0.5 / np.sqrt(29 / 3))
+    assert PairedTests.of(sample).interval == pytest.approx((0.5 - reach, 0.5 + reach))
+    assert PairedTests.of(sample).cohen_dz == pytest.approx(0.5 / np.sqrt(29 / 3))
     assert rank_biserial(sample) == pytest.approx((1 + 2 + 3 - 4) / 10)
     assert [rank_biserial(np.array(each)) for each in ([0.0] * 3, [0.0, 1.0, 2.0])] == [0.0, 1.0]
     for value in (0.0, 0.1, -3.7):
-        assert t_statistics(np.full(7, value)) == (None, None, pytest.approx((value, value)))
+        equal = PairedTests.of(np.full(7, value))
+        assert (equal.t_test, equal.cohen_dz, equal.interval) == (None, None, pytest.approx((value, value)))
