@@ -395,5 +395,5 @@ def import_splats(options: ImportOptions) -> Run:
     scene = options.data.resolve().name
     folder = RunFolder.default(scene, "imported") if options.output is None else RunFolder(options.output)
     device = choose_device(options.device)
-    import_run(options.file, options.data, folder, device, options.data_format, options.overwrite)
+    import_run(options, folder, device)
     return Run(folder.path, data=options.data, device=options.device)

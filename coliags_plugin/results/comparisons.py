@@ -130,10 +130,16 @@ def compare_with_rivals(
     }
     samples = {rival: [*each.values()] for rival, each in leads.items() if len(each) >= FEWEST_SCENES}
     tests = {rival: PairedTests.of(np.array(sample)) for rival, sample in samples.items()}
-    for name in ("wilcoxon", "t_test"):
-        p_values = {rival: getattr(test, name) for rival, test in tests.items() if getattr(test, name) is not None}
-        for rival, p in zip(p_values, holm([*p_values.values()], max(family, len(leads))), strict=True):
-            tests[rival] = replace(tests[rival], **{f"{name}_holm": p})
+    wilcoxon = {rival: each.wilcoxon for rival, each in tests.items()}
+    t_test = {rival: each.t_test for rival, each in tests.items() if each.t_test is not None}
+    wilcoxon_holm, t_test_holm = (
+        dict(zip(p_values, holm([*p_values.values()], max(family, len(leads))), strict=True))
+        for p_values in (wilcoxon, t_test)
+    )
+    tests = {
+        rival: replace(each, wilcoxon_holm=wilcoxon_holm[rival], t_test_holm=t_test_holm.get(rival))
+        for rival, each in tests.items()
+    }
     return [
         RivalComparison(
             rival=rival,

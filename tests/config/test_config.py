@@ -263,23 +263,7 @@ paths = st.from_regex(r"[a-z_]{1,8}(\.[a-z_]{1,8}){0,2}", fullmatch=True)
 
 
 #: Texts that would be read as something else.
-LOOKING_LIKE_OTHERS = (
-    "1e5",
-    "1.5",
-    "on",
-    "yes",
-    "null",
-    "~",
-    "true",
-    "",
-    " x ",
-    "a: b",
-    "[1]",
-    "#1",
-    "1_000",
-    "0x1f",
-    "12:30",
-)
+LOOKING_LIKE_OTHERS = (*"1e5 1.5 on yes null ~ true [1] #1 1_000 0x1f 12:30".split(), "", " x ", "a: b")
 
 
 @settings(max_examples=40, deadline=None)

@@ -1,4 +1,4 @@
-"""Rates, and rows of parameters that come and go, and values that are replaced, together with Adam's moments."""
+"""Rates, rows that come and go, and values that are replaced, together with Adam's moments; samplers of steps."""
 
 from __future__ import annotations
 
@@ -6,9 +6,12 @@ import pytest
 import torch
 from torch import nn
 
+from coliags_plugin.config.components import make_component
 from coliags_plugin.config.method_config import OptimizerSettings
+from coliags_plugin.core.scenes import concatenate_targets
 from coliags_plugin.engine.model import Model
 from coliags_plugin.engine.optimizers import Optimizers
+from tests.scenes import wall_scene
 
 
 class Rows(nn.Module):
@@ -101,3 +104,44 @@ def test_beta2_sets_how_long_squared_gradients_are_remembered():
         optimizers.step(step)
     second = (0.9 * 0.4 + 0.1 * 1.0) / (1 - 0.9**2)
     torch.testing.assert_close(field.points.detach(), before - 0.1 * (1.0 + second))
+
+
+# Samplers: the frames and pixels of a training step
+
+SIZES = [(7, 5), (4, 3), (6, 6)]
+
+
+def make_sampler(name="pixels", seed=0, **options):
+    component = make_component("samplers", {"name": name, **options})
+    return component.target(component.settings, SIZES, torch.Generator().manual_seed(seed))
+
+
+def test_frames_come_whole_and_each_once_per_round():
+    sampler = make_sampler("frames")
+    drawn = [sampler.next() for _ in range(6)]
+    assert all(len(draws) == 1 and draws[0].pixels is None for draws in drawn)
+    assert sorted(draws[0].frame for draws in drawn[:3]) == sorted(draws[0].frame for draws in drawn[3:]) == [0, 1, 2]
+
+
+@pytest.mark.parametrize(("pixels", "frames", "counts"), [(10, 3, [3, 3, 4]), (8, 1, [8]), (2, 5, [1, 1])])
+def test_pixels_are_shared_between_frames_and_every_one_comes_up(pixels, frames, counts):
+    sampler, drawn = make_sampler(pixels=pixels, frames=frames), set()
+    for _ in range(600):
+        draws = sampler.next()
+        assert sorted(len(draw.pixels) for draw in draws) == sorted(counts)
+        drawn |= {(draw.frame, *pixel) for draw in draws for pixel in draw.pixels.tolist()}
+    assert drawn == {
+        (index, x, y) for index, (width, height) in enumerate(SIZES) for x in range(width) for y in range(height)
+    }
+
+
+def test_targets_at_pixels():
+    frames = wall_scene().train[:2]
+    pixels = torch.tensor([[3, 1], [30, 20]])
+    target = frames[0].target_at(pixels)
+    assert target.image.shape == (2, 1, 3) and target.depth.shape == (2, 1)
+    assert torch.equal(target.image[1, 0], frames[0].image[20, 30])
+    assert target.depth[0, 0] == frames[0].depth[1, 3]
+    both = concatenate_targets([target, frames[1].target_at(pixels)])
+    assert both.image.shape == (4, 1, 3) and both.name == "0001, 0002"
+    assert both.mask is None and both.depth[2, 0] == frames[1].depth[1, 3]

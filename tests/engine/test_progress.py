@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from unittest import mock
 
 import pytest
 from rich.console import Console
@@ -60,30 +61,15 @@ def test_a_terminal_shows_the_facts_and_the_end(clock):
     assert all(text in console.file.getvalue() for text in ("train", "4/4", "loss 0.1"))
 
 
-class Shown:
-    """Stand-in for a notebook: the text it shows at last, and how often it changed."""
-
-    def __init__(self):
-        self.text, self.changes = "", 0
-
-    def __call__(self, data, raw, display_id):
-        assert raw and display_id
-        return self.update(data, raw)
-
-    def update(self, data, raw):
-        assert raw and data.keys() == {"text/plain"}
-        self.text, self.changes = data["text/plain"], self.changes + 1
-        return self
-
-
 def test_a_notebook_shows_one_line_that_changes(clock, monkeypatch, capsys):
-    shown = Shown()
-    monkeypatch.setattr("IPython.display.display", shown)
-    console = Console(force_jupyter=True)
-    with ProgressReport("train", 1000, console=console) as report:
+    display = mock.Mock()
+    monkeypatch.setattr("IPython.display.display", display)
+    with ProgressReport("train", 1000, console=Console(force_jupyter=True)) as report:
         for count_done in range(1, 1001):
             clock[0] += 0.01
             report.update(count_done, f"loss {count_done}")
-    assert shown.text == "train 1000/1000, took 10.0 s  loss 1000"
-    assert 15 <= shown.changes <= 22  # two a second
+    assert display.call_count == 1 and display.call_args.kwargs == {"raw": True, "display_id": True}
+    changes = display.return_value.update.call_args_list
+    assert changes[-1] == mock.call({"text/plain": "train 1000/1000, took 10.0 s  loss 1000"}, raw=True)
+    assert 15 <= len(changes) <= 22  # two a second
     assert capsys.readouterr() == ("", "")
