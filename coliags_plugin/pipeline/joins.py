@@ -37,9 +37,9 @@ class SegmentJoin(BaseModel):
     model_config = ConfigDict(extra="ignore", frozen=True, allow_inf_nan=False)
 
     segments: tuple[str, str]
-    models: tuple[str, str]  # folders, relative to the segments' scenes; empty where a side has none
-    frames: int  # posed in both
-    joined: bool
+    models: tuple[str, str] = ("", "")  # folders, relative to the segments' scenes; empty where a side has none
+    frames: int = 0  # posed in both
+    joined: bool = False
     reason: str = ""  # why not
     #: similarity from the world of the second to that of the first; None where they are not joined. [4][4]
     transform: Annotated[list[Row], Field(min_length=4, max_length=4)] | None = None
@@ -101,7 +101,7 @@ def find_joins(out: Path, segments: Sequence[Segment]) -> list[SegmentJoin]:
     for (first, before), (second, after) in pairwise(zip(segments, posed, strict=True)):
         names, gap = (first.name, second.name), second.first - first.last - 1
         why = f"{gap} frames between them show nothing that can be followed"
-        places += joins(names, before, after) if gap < 0 else [_apart(names, why)]
+        places += joins(names, before, after) if gap < 0 else [SegmentJoin(segments=names, reason=why)]
     return places
 
 
@@ -109,12 +109,7 @@ def joins(segments: tuple[str, str], first: list[PosedFrames], second: list[Pose
     """Joins of models of one segment with those of the next: of all that share frames, or why there is none."""
     tried = sorted((_join_models(segments, *pair) for pair in product(first, second)), key=lambda join: -join.frames)
     sharing = [join for join in tried if join.frames >= _FEWEST]
-    return sharing or tried[:1] or [_apart(segments, "no frame has a pose on one side")]
-
-
-def _apart(segments: tuple[str, str], reason: str, models: tuple[str, str] = ("", ""), frames: int = 0) -> SegmentJoin:
-    """A place at which nothing could be compared."""
-    return SegmentJoin(segments=segments, models=models, frames=frames, joined=False, reason=reason)
+    return sharing or tried[:1] or [SegmentJoin(segments=segments, reason="no frame has a pose on one side")]
 
 
 def _join_models(segments: tuple[str, str], first: PosedFrames, second: PosedFrames) -> SegmentJoin:
@@ -127,7 +122,7 @@ def _join_models(segments: tuple[str, str], first: PosedFrames, second: PosedFra
     models = (first.model, second.model)
     if len(names) < _FEWEST:
         reason = f"{len(names)} frames have a pose on both sides, fewer than {_FEWEST}"
-        return _apart(segments, reason, models, len(names))
+        return SegmentJoin(segments=segments, models=models, frames=len(names), reason=reason)
     ratios = np.array([first.depths[name] / second.depths[name] for name in names])
     scale = float(np.median(ratios))
     spread = float(np.median(np.abs(ratios / scale - 1.0)))

@@ -19,11 +19,9 @@ from coliags_plugin.pipeline.stages import PAGE_FILE, Record, StageRecord
 from coliags_plugin.pipeline.steps import PICTURES, SCENE
 from coliags_plugin.pipeline.timeline import (
     State,
-    clock,
     clock_span,
     frame_states,
     span_text,
-    stretches,
     timeline,
 )
 from coliags_plugin.reporting.html_page import write_html
@@ -56,8 +54,6 @@ _LIMIT, _SCENES = 50_000_000, 36_000_000
 _SUBMAPS, _VIEWS = 8, 6
 #: Pictures of a frame, in order.
 _KINDS = ("recorded.png", "depth.png", "flattened light.png")
-#: Stretches without a pose that are listed, the longest.
-_LISTED = 200
 #: Items named in a sentence, and sentences about what limits the result; rows of a table above which it is folded.
 _NAMED = 5
 #: Columns that are left out where no sub-map has them.
@@ -93,7 +89,7 @@ def write_page(out: Path, record: Record | None = None, scene: Path | None = Non
     ]
     if contents.has_frames:
         sections.insert(0, Section("Time line", [Paragraph(_TIMELINE), timeline(contents, states)]))
-        sections.append(Section("Frames without a pose", list(_without_pose(contents, states))))
+        sections.append(Section("Frames without a pose", [_without_pose(contents, states)]))
     sections.append(Section("Stages and files", list(_stages(contents))))
     title = f"Reconstruction of {contents.video.source}"
     page = Page(title, sections, list(_facts(contents)), "For research use only.", remarks(contents))
@@ -340,33 +336,14 @@ def _seen_of(submap: SubmapContents) -> str | None:
     return f"{100.0 * submap.figures['seen']:.0f} %" if "seen" in submap.figures else _area_of(submap, "seen_area")
 
 
-def _without_pose(contents: Contents, states: Sequence[State]) -> Iterator[Block]:
-    """Reasons by how many frames they concern, and the stretches."""
-    counts = Counter(state for state in states if state.style is None).most_common()
-    if not counts:
-        yield Paragraph("Every frame has a pose.", hint=False)
-        return
-    shares = [100.0 * count / contents.video.frames for _, count in counts]
-    rows: list[list[Value | TableCell]] = [
-        [state.why or state.what, state.what, count, TableCell(f"{share:.1f}", share)]
-        for (state, count), share in zip(counts, shares, strict=True)
-    ]
+def _without_pose(contents: Contents, states: Sequence[State]) -> Block:
+    """Reasons by how many frames they concern."""
     head: list[str | Column] = ["Why", Column("What", words=True), "Frames", Column("Share", unit="% of the video")]
-    yield simple_table(head, rows, "reasons")
-    without = [(stretch, state) for stretch, state in stretches(contents, states) if state.style is None]
-    longest = sorted(without, key=lambda pair: -pair[0].count)[:_LISTED]
-    listed: list[list[Value]] = [
-        [
-            f"{stretch.first} to {stretch.last}" if stretch.count > 1 else str(stretch.first),
-            clock(contents, stretch.first),
-            stretch.count,
-            state.why or state.what,
-        ]
-        for stretch, state in sorted(longest, key=lambda pair: pair[0].first)
-    ]
-    columns: list[str | Column] = ["Frames", Column("From", words=True), "Number", Column("Why", words=True)]
-    shown = f"the {_LISTED} longest of {len(without)}" if len(without) > _LISTED else str(len(without))
-    yield Folded(f"Stretches without a pose ({shown})", [simple_table(columns, listed, "stretches")])
+    rows: list[list[Value | TableCell]] = []
+    for state, count in Counter(state for state in states if state.style is None).most_common():
+        share = 100.0 * count / contents.video.frames
+        rows.append([state.why or state.what, state.what, count, TableCell(f"{share:.1f}", share)])
+    return simple_table(head, rows, "reasons") if rows else Paragraph("Every frame has a pose.", hint=False)
 
 
 def _stages(contents: Contents) -> Iterator[Block]:

@@ -111,7 +111,10 @@ def reconstruct(
         jobs = StageJobs(record, segments, overwrite, executor, options)
         jobs.run()
         if len(segments) != 1:
-            _join(out, record)
+            joins = find_joins(out, figures_as(record.stages, "survey", Video, out).segments)
+            summary = f"{sum(join.joined for join in joins)} of {counted(len(joins), 'join')}"
+            figures = {"joins": [join.model_dump(mode="json") for join in joins]}
+            record.put("joins", StageRecord(summary, figures=figures))
         write_page(out, record, source)
     if not segments:
         raise InputError(
@@ -145,13 +148,6 @@ def _segments(context: StageContext, record: Record, overwrite: bool) -> list[tu
         of_segment = settings.model_copy(update={"frames": settings.frames.model_copy(update=span)})
         segments.append((replace(context, segment=segment.name, settings=of_segment), segment.count))
     return segments
-
-
-def _join(out: Path, record: Record) -> None:
-    """Record how the segments are joined."""
-    joins = find_joins(out, figures_as(record.stages, "survey", Video, out).segments)
-    summary = f"{sum(join.joined for join in joins)} of {counted(len(joins), 'join')}"
-    record.put("joins", StageRecord(summary, figures={"joins": [join.model_dump(mode="json") for join in joins]}))
 
 
 def _refuse_unused(source: Path, settings: ReconstructionSettings, mask: Path | None) -> None:

@@ -99,7 +99,9 @@ class Record:
         record = cls(folder)
         record.places = (folder, *places)
         if not record.refresh() and folder.exists():
-            if not folder.is_dir() or any(not _is_ours(path) for path in folder.iterdir()):
+            # Before the record, there is a lock, or what a kill has left of writing the record.
+            others = (path.name for path in folder.glob("*") if not path.name.startswith(f".{RECORD_FILE}."))
+            if not folder.is_dir() or any(name != LOCK_FILE for name in others):
                 raise InputError(
                     f"{folder} already exists and is no reconstruction",
                     "a new or empty folder, or one that `coliags reconstruct` made",
@@ -198,11 +200,6 @@ def _read(file: Path) -> dict[str, StageRecord]:
             return _RECORDED.validate_python(content["stages"])
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise InputError(f"cannot read {file}: {error}", MADE, "Choose another `output`") from error
-
-
-def _is_ours(path: Path) -> bool:
-    """True if a file is there before the record is: a lock, or what a kill has left of writing the record."""
-    return path.name == LOCK_FILE or path.name.startswith(f".{RECORD_FILE}.")
 
 
 def run_stages(stages: Sequence[Stage], record: Record) -> None:

@@ -16,7 +16,6 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import read_rgb
 from coliags_plugin.pipeline.contents import Contents
 from coliags_plugin.pipeline.frames import THINNED
-from coliags_plugin.pipeline.survey import Stretch
 from coliags_plugin.reporting.html_page import COLORS
 from coliags_plugin.reporting.image_files import EncodedImage
 from coliags_plugin.reporting.model import Template
@@ -73,15 +72,6 @@ def frame_states(contents: Contents) -> list[State]:
     return [state or State("left out", "in no segment") for state in states]
 
 
-def stretches(contents: Contents, states: Sequence[State]) -> Iterator[tuple[Stretch, State]]:
-    """Runs of one state, along the video."""
-    first = contents.video.first
-    for state, run in groupby(states):
-        last = first + sum(1 for _ in run) - 1
-        yield Stretch(first, last), state
-        first = last + 1
-
-
 def _in_columns(states: Sequence[State]) -> list[State]:
     """The states of a long video with the commonest one in each of 2,000 columns, for a page of bounded size."""
     if len(states) <= _COLUMNS:
@@ -133,10 +123,11 @@ def timeline(contents: Contents, states: Sequence[State]) -> Template:
         title = "; ".join(filter(None, (f"{name}: {span_text(contents, first, last)}", why)))
         return {"left": percent(first), "width": round(percent(last + 1) - percent(first), 3), "title": title}
 
-    ribbon = [
-        {**bar(stretch.first, stretch.last, state.what, state.why), "style": state.style}
-        for stretch, state in stretches(contents, _in_columns(states))
-    ]
+    ribbon, first = list[dict[str, Any]](), video.first
+    for state, run in groupby(_in_columns(states)):
+        stop = first + sum(1 for _ in run)
+        ribbon.append({**bar(first, stop - 1, state.what, state.why), "style": state.style})
+        first = stop
     segments = [
         {
             **bar(span.first, span.last, span.name, segment.failure),

@@ -51,10 +51,6 @@ class Key(NamedTuple):
     size: int  # bytes
     before: int  # decoding time of the key frame before: packets behind the place sought may have wrong times
 
-    def is_in(self, packet: Packet) -> bool:
-        """Return True if a packet holds this key frame."""
-        return bool(packet.is_keyframe) and (packet.pts, packet.size) == (self.time, self.size)
-
 
 @dataclass(frozen=True, eq=False)
 class VideoIndex:
@@ -332,7 +328,7 @@ class VideoFile:
                     container.seek(key.before, stream=stream)
             is_first = key is None
             for packet in _filled(container, stream):
-                if key is not None and not key.is_in(packet):
+                if key is not None and not (packet.is_keyframe and (packet.pts, packet.size) == (key.time, key.size)):
                     continue
                 key, is_first, is_before = None, False, is_before or (is_first and not packet.is_keyframe)
                 if is_lost and not packet.is_keyframe:

@@ -116,10 +116,7 @@ def round_up(value: float) -> float:
     """The smallest 1, 2 or 5 times a power of ten that is not below ``value``, which is positive and finite."""
     exponent = math.floor(math.log10(value))
     power = 10.0**exponent if exponent >= 0 else 1.0 / 10.0**-exponent
-    for step in _TICK_STEPS:
-        if value <= step * power * (1.0 + _SLACK):
-            return step * power
-    return 10.0 * power
+    return next((step * power for step in _TICK_STEPS if value <= step * power * (1.0 + _SLACK)), 10.0 * power)
 
 
 def linear_ticks(low: float, high: float, count: int = 5) -> list[float]:

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import io
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from rich.console import Console
-from rich.table import Table as Grid
-from rich.text import Text
+from rich.cells import cell_len
 
 from coliags_plugin.reporting.model import (
     Block,
@@ -28,8 +25,6 @@ from coliags_plugin.reporting.model import (
 )
 from coliags_plugin.reporting.numbers import DASH, sentence, unit_text
 
-#: Columns that a terminal is taken to have, so that no line is broken.
-_WIDEST = 100_000
 _MARKDOWN_SPECIAL = re.compile(r"([\\`*_{}\[\]<>|#~])")
 _HEAD = "% Needs \\usepackage{booktabs}, and \\usepackage[T1]{fontenc} for names with underscores."
 _ESCAPES = {
@@ -275,13 +270,13 @@ class DisplayTable(Table):
 
 def _aligned(rows: Sequence[Sequence[str]], alignment: str) -> str:
     """Rows of cells as lines; ``l`` or ``r`` for each column."""
-    grid = Grid.grid(padding=(0, 2))
-    for side in alignment:
-        grid.add_column(justify="right" if side == "r" else "left", no_wrap=True)
-    for row in rows:
-        grid.add_row(*map(Text, row))
-    console = Console(file=io.StringIO(), width=_WIDEST, color_system=None, force_jupyter=False)
-    return "\n".join("".join(part.text for part in line).rstrip() for line in console.render_lines(grid, pad=False))
+    widths = [max(map(cell_len, column)) for column in zip(*rows, strict=True)]
+
+    def padded(cell: str, width: int, side: str) -> str:
+        space = " " * (width - cell_len(cell))
+        return space + cell if side == "r" else cell + space
+
+    return "\n".join("  ".join(map(padded, row, widths, alignment)).rstrip() for row in rows)
 
 
 def page_values(page: Page) -> dict[str, Any]:
