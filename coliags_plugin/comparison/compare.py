@@ -13,8 +13,7 @@ from typing import get_args
 
 from coliags_plugin.comparison.folder import ComparisonFolder
 from coliags_plugin.comparison.named_files import Variant
-from coliags_plugin.comparison.plan import ComparisonCell, Request, make_cells
-from coliags_plugin.comparison.plan_file import FailureRecord
+from coliags_plugin.comparison.plan import ComparisonCell, FailureRecord, make_cells
 from coliags_plugin.comparison.scenes import find_scenes, make_phantoms
 from coliags_plugin.comparison.worker import CellTask
 from coliags_plugin.config import registry
@@ -61,7 +60,7 @@ class CellJob(Job):
             key=planned.key,
             folder=self._run.path,
             device=device,
-            log=comparison.path / planned.log,
+            log=comparison.path / planned.log_file,
             threads=executor.threads,
             name=cell.variant.name,
             method=str(user_path(method).resolve()) if is_path(method) else method,
@@ -197,17 +196,18 @@ def carry_out(
         InputError: Something is not valid or not there; nothing was run.
         InterruptedRunError: Ctrl-C; all runs are saved.
     """
-    request, comparison = make_request(methods, options), ComparisonFolder(options.output)
+    comparison = ComparisonFolder(options.output)
+    comparison.check_extends(options)
+    cells = plan_cells(methods, options)
     names = ("jobs", "threads", "device", "executor", "ray_address", "retries")
     execution = ExecutionOptions(**{name: getattr(options, name) for name in names})
     executor = make_executor(execution)
-    cells = _plan_cells(request, comparison)
     with comparison.held():
         missing = {cell.scene.name: cell for cell in cells if comparison.done(cell) is None}
         if any(not cell.scene.is_there for cell in missing.values()):
             with progress_callback() as progress:
                 make_phantoms([cell.scene for cell in missing.values()], progress)
-            cells = make_cells(request, comparison.recorded_fingerprint)
+            cells = plan_cells(methods, options)
             missing = {cell.scene.name: cell for cell in cells if comparison.done(cell) is None}
         log.info("%s", _states(cells, comparison).title)
         if missing:
@@ -216,7 +216,7 @@ def carry_out(
             for cell in missing.values():
                 with suppress(InputError):  # of which the cell fails
                     check_data(data_manager(cell.config.datamanager, cell.scene.path).load(cell.scene.path))
-        comparison.record(request, cells)
+        comparison.record(options, cells)
         run_cells(cells, comparison, executor, execution)
         results = [(cell.title, result) for cell in cells if (result := comparison.done(cell)) is not None]
     for title, result in results:
@@ -229,7 +229,8 @@ def carry_out(
 def dry_run(methods: Methods, options: CompareOptions) -> DisplayTable:
     """List what :func:`carry_out` would do with each cell; writes nothing."""
     comparison = ComparisonFolder(options.output)
-    cells = _plan_cells(make_request(methods, options), comparison)
+    comparison.check_extends(options)
+    cells = plan_cells(methods, options)
     comparison.read_results()
     return _states(cells, comparison)
 
@@ -239,17 +240,17 @@ def _states(cells: Sequence[ComparisonCell], comparison: ComparisonFolder) -> Di
     rows: list[dict[str, Value]] = []
     keys: set[str] = set()
     for cell in cells:
-        key, step, changed = "" if cell.fingerprint is None else cell.planned.key, 0, ""
-        if comparison.done(cell) is not None:
-            state = "done"
-        elif key in keys:
-            state = "same"
-        elif not cell.scene.is_there:
+        step, changed = 0, ""
+        if cell.fingerprint is None:
             state = "scene to make"
+        elif comparison.done(cell) is not None:
+            state = "done"
+        elif cell.planned.key in keys:
+            state = "same"
         else:
+            keys.add(cell.planned.key)
             step, changed = comparison.run(cell).step, comparison.changes(cell)
             state = "resume" if step else "new"
-        keys |= {key} if key else set()
         steps = f"{step} of {cell.steps}" if step else str(cell.steps)
         rows.append({"cell": cell.title, "state": state, "steps": steps, "changed": changed or None})
     columns = [Column("cell"), Column("state", words=True), Column("steps")]
@@ -260,15 +261,8 @@ def _states(cells: Sequence[ComparisonCell], comparison: ComparisonFolder) -> Di
     return DisplayTable(f"{len(cells)} cells: {states}", columns, rows)
 
 
-def _plan_cells(request: Request, comparison: ComparisonFolder) -> list[ComparisonCell]:
+def plan_cells(methods: Methods, options: CompareOptions) -> list[ComparisonCell]:
     """The cells that are asked for, after what can be checked without writing anything."""
-    comparison.check()
-    comparison.check_extends(request)
-    return make_cells(request, comparison.recorded_fingerprint)
-
-
-def make_request(methods: Methods, options: CompareOptions) -> Request:
-    """Make a request, checked as far as names and numbers go; arguments as in :func:`coliags_plugin.compare`."""
     methods = [methods] if isinstance(methods, (str, Variant)) else methods
     variants = [each if isinstance(each, Variant) else Variant(method_name(each), each) for each in methods]
     if not variants:
@@ -291,4 +285,4 @@ def make_request(methods: Methods, options: CompareOptions) -> Request:
     metrics = [*protocol.metrics, *protocol.optional_metrics]
     for name in options.primary:
         check_name("metric", name, [*metrics, *(metric + SEEN_SUFFIX for metric in metrics)])
-    return Request(variants, find_scenes([str(scene) for scene in options.scenes], options.data), options)
+    return make_cells(variants, find_scenes([str(scene) for scene in options.scenes], options.data), options)

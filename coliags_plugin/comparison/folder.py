@@ -8,19 +8,17 @@ from contextlib import contextmanager
 from datetime import datetime, timezone
 from pathlib import Path
 
-from coliags_plugin.comparison.plan import ComparisonCell, Request
-from coliags_plugin.comparison.plan_file import (
+from coliags_plugin.comparison.plan import (
     PLAN_FILE,
     RESULTS,
+    ComparisonCell,
     ComparisonPlan,
     Decision,
     FailureRecord,
-    PlannedScene,
     read_plan,
 )
-from coliags_plugin.comparison.scenes import SceneSource
 from coliags_plugin.config.assignments import parse_assignments
-from coliags_plugin.core import __version__
+from coliags_plugin.config.options import CompareOptions
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import write_json
 from coliags_plugin.core.jobs import locked
@@ -42,8 +40,7 @@ class ComparisonFolder:
 
     def __init__(self, path: Path) -> None:
         self.path = path.resolve()
-        self._by_path: dict[Path, Result] = {}  # as of read_results, and added since
-        self._by_key: dict[str, Result] = {}
+        self._results: dict[Path, Result] = {}  # as of read_results, and added since
         self.failures: list[FailureRecord] = []  # of this process
 
     def run(self, cell: ComparisonCell) -> RunFolder:
@@ -53,12 +50,15 @@ class ComparisonFolder:
     @contextmanager
     def held(self) -> Iterator[None]:
         """Keep other comparisons out of the folder, which is created where it is missing, and read its results."""
-        self.check()
         with locked(self.path / ".lock", self.path):
             self.read_results()
             yield
 
-    def check(self) -> None:
+    def plan(self) -> ComparisonPlan:
+        """Plan of all that was asked for so far; empty where nothing was."""
+        return read_plan(self.path) or ComparisonPlan()
+
+    def _check_kind(self) -> None:
         """Refuse a folder that holds something else than comparisons."""
         if self.path.exists() and not self.path.is_dir():
             raise InputError(f"{self.path} is a file", "a folder", "Choose another `output`")
@@ -72,14 +72,11 @@ class ComparisonFolder:
                     "Choose another `output`",
                 )
 
-    def plan(self) -> ComparisonPlan:
-        """Plan of all that was asked for so far; empty where nothing was."""
-        return read_plan(self.path) or ComparisonPlan()
-
-    def check_extends(self, request: Request) -> None:
+    def check_extends(self, options: CompareOptions) -> None:
         """Refuse to mix runs of different length or with different changes, and to decide after the first run."""
-        before, options = read_plan(self.path), request.options
-        decided, now = None if before is None else before.decided, _decision(request)
+        self._check_kind()
+        before = read_plan(self.path)
+        decided, now = None if before is None else before.decided, _decision(options)
         is_begun = before is not None or (self.path / RESULTS).is_dir()
         if is_begun and now is not None and now != (decided and decided.model_copy(update={"date": now.date})):
             earlier = "nothing" if decided is None else f"{decided.reference} by {', '.join(decided.primary)}"
@@ -101,13 +98,12 @@ class ComparisonFolder:
                     f"{self.path} compares runs with {earlier}, not {later}", "the same, or another `output`"
                 )
 
-    def record(self, request: Request, cells: Sequence[ComparisonCell]) -> None:
+    def record(self, options: CompareOptions, cells: Sequence[ComparisonCell]) -> None:
         """Add to the plan what is asked for now; a cell whose key has changed replaces the former one.
 
         Only a new plan takes up a decision.
         """
-        former = read_plan(self.path)
-        before = former or ComparisonPlan(decided=_decision(request))
+        before = read_plan(self.path) or ComparisonPlan(decided=_decision(options))
         entries = {entry.identity: entry for entry in before.cells}
         planned = {cell.planned.identity: cell.planned for cell in cells}
         changed = [name for name, cell in planned.items() if name in entries and entries[name].key != cell.key]
@@ -118,26 +114,13 @@ class ComparisonFolder:
                 len(changed),
                 *changed[0][:3],
             )
-        scenes = {
-            cell.scene.name: PlannedScene(
-                phantom=cell.scene.phantom_record, fingerprint=cell.fingerprint, package_version=__version__
-            )
-            for cell in cells
-            if cell.fingerprint is not None
-        }
         plan = ComparisonPlan(
-            steps=request.options.steps,
-            overrides=request.options.settings,
+            steps=options.steps,
+            overrides=options.settings,
             decided=before.decided,
-            scenes={**before.scenes, **scenes},
             cells=tuple({**entries, **planned}.values()),
         )
         write_json(self.path / PLAN_FILE, plan.model_dump(mode="json"))
-
-    def recorded_fingerprint(self, scene: SceneSource) -> str | None:
-        """Fingerprint of a phantom that is not there, if this version made the same one for this folder before."""
-        entry, same = self.plan().scenes.get(scene.name), (scene.phantom_record, __version__)
-        return entry.fingerprint if entry and (entry.phantom, entry.package_version) == same else None
 
     def read_results(self) -> None:
         """Read the results that are there; half-written and damaged files are reported and left as they are.
@@ -145,29 +128,28 @@ class ComparisonFolder:
         Raises:
             NewerResultError: A file is from a newer version.
         """
-        self._by_path.clear()
+        self._results.clear()
         for path in sorted((self.path / RESULTS).rglob("[!.]*.json")):
             try:
-                self._by_path[path] = read_result(path)
+                self._results[path] = read_result(path)
             except NewerResultError:
                 raise
             except InputError as error:
                 log.warning("not counted as done: %s", error)
-        self._by_key = {result.key: result for result in self._by_path.values()}
 
     def done(self, cell: ComparisonCell) -> Result | None:
         """The result of a cell; under another name where another method is the same; None where it is not done."""
         if cell.fingerprint is None:
             return None
-        result, key = self._by_path.get(self.path / cell.planned.result), cell.planned.key
-        return result if result is not None and result.key == key else self._by_key.get(key)
+        key, own = cell.planned.key, self._results.get(self.path / cell.planned.result)
+        if own is not None and own.key == key:
+            return own
+        return next((result for result in self._results.values() if result.key == key), None)
 
     def changes(self, cell: ComparisonCell) -> str:
         """Reasons why a cell's earlier result is out of date, for instance ``code, data``; empty without one."""
-        if cell.fingerprint is None:
-            return ""
         place, _, _ = str(self.path / cell.planned.result).rpartition("-")  # without the key
-        former = [each for path, each in self._by_path.items() if str(path).rpartition("-")[0] == place]
+        former = [each for path, each in self._results.items() if str(path).rpartition("-")[0] == place]
         former = [each for each in former if each.protocol.name == cell.protocol]
         if not former:
             return ""
@@ -187,25 +169,24 @@ class ComparisonFolder:
         if result.method != name:
             provenance = {**result.provenance, "same_as": result.method}
             result = result.model_copy(update={"method": name, "provenance": provenance})
-        if self._by_path.get(path) != result:
+        if self._results.get(path) != result:
             write_result(path, result)
-        self._by_path[path] = self._by_key[result.key] = result
-        (self.path / cell.planned.failure).unlink(missing_ok=True)
+        self._results[path] = result
+        (self.path / cell.planned.failure_file).unlink(missing_ok=True)
 
     def fail(self, cell: ComparisonCell, reason: str, attempts: int) -> None:
         """Record why a cell failed; a full disk loses the record, not the reason."""
         reason, planned = without_places(reason, (self.path, cell.scene.path)), cell.planned
-        names = planned.model_dump(exclude={"run", "result"})
-        failure = FailureRecord(**names, reason=reason, attempts=attempts, log=planned.log)
+        failure = FailureRecord(**planned.model_dump(), reason=reason, attempts=attempts, log=planned.log_file)
         try:
-            write_json(self.path / planned.failure, failure.model_dump(mode="json"))
+            write_json(self.path / planned.failure_file, failure.model_dump(mode="json"))
         except InputError as error:
             log.warning("%s", error)
         self.failures.append(failure)
 
 
-def _decision(request: Request) -> Decision | None:
-    """Decision that a request makes before the first run; None without one."""
-    reference, primary = request.options.reference, tuple(dict.fromkeys(request.options.primary))
+def _decision(options: CompareOptions) -> Decision | None:
+    """Decision that is made before the first run; None without one."""
+    reference, primary = options.reference, tuple(dict.fromkeys(options.primary))
     today = datetime.now(timezone.utc).date().isoformat()
     return None if reference is None else Decision(reference=reference, primary=primary, date=today)

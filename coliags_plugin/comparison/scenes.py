@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from coliags_plugin.comparison.named_files import load_benchmark, shipped
 from coliags_plugin.config.method_config import is_path
@@ -42,17 +40,8 @@ class SceneSource:
         """Tell whether the folder is there."""
         return self.path.is_dir()
 
-    @property
-    def phantom_record(self) -> dict[str, Any] | None:
-        """All settings of the phantom as plain data, defaults of its layout and light included."""
-        if self.phantom is None:
-            return None
-        settings = resolve(self.phantom, phantom_layouts.get(self.phantom.layout)())
-        record: dict[str, Any] = json.loads(settings.model_dump_json())
-        return record
 
-
-def find_scenes(names: Sequence[str], data: Path | None = None) -> list[SceneSource]:
+def find_scenes(names: Sequence[str], data: Path | None) -> list[SceneSource]:
     """The scenes that names stand for.
 
     Each is a benchmark, ``BENCHMARK/SCENE``, the path of a benchmark's YAML file, or the folder of a scene. Those of a
@@ -89,11 +78,11 @@ def find_scenes(names: Sequence[str], data: Path | None = None) -> list[SceneSou
         )
     for source in sources:
         if source.is_there and source.phantom is not None:
-            _check_same_phantom(source)
+            _check_same_phantom(source.path, source.phantom)
     return sources
 
 
-def make_phantoms(sources: Sequence[SceneSource], progress: Progress | None = None) -> None:
+def make_phantoms(sources: Sequence[SceneSource], progress: Progress) -> None:
     """Make every phantom that is missing."""
     for source in sources:
         if source.phantom is None or source.is_there:
@@ -128,23 +117,23 @@ def _scenes_of(file: str, only: str | None, data: Path) -> list[SceneSource]:
     return sources
 
 
-def _check_same_phantom(source: SceneSource) -> None:
-    """Refuse a folder with another phantom than the benchmark's."""
-    file = source.path / "phantom.json"
+def _check_same_phantom(folder: Path, phantom: PhantomSettings) -> None:
+    """Refuse a folder with another phantom than the benchmark's; defaults of its layout and light are compared too."""
+    file = folder / "phantom.json"
     try:
         settings = dict(parse_json(json_text(file))["settings"])
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise InputError(
-            f"{source.path} is not a phantom: {file.name} cannot be read", "the benchmark's phantom, or no folder"
+            f"{folder} is not a phantom: {file.name} cannot be read", "the benchmark's phantom, or no folder"
         ) from error
-    expected = source.phantom_record or {}
+    expected = resolve(phantom, phantom_layouts.get(phantom.layout)()).model_dump(mode="json")
     differing = [key for key in {**expected, **settings} if settings.get(key, ...) != expected.get(key, ...)]
     if differing:
         differences = ", ".join(
             f"{key} {settings.get(key, 'missing')!r} instead of {expected.get(key, 'none')!r}" for key in differing
         )
         raise InputError(
-            f"{source.path} is another phantom than the benchmark's: {differences}",
+            f"{folder} is another phantom than the benchmark's: {differences}",
             "the benchmark's phantom as this version makes it, or no folder",
             "Remove it, so that it is made again, or choose another `data`",
         )

@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from coliags_plugin.comparison.plan_file import PlannedCell, read_plan
+from coliags_plugin.comparison.plan import PlannedCell, read_plan
 from coliags_plugin.reporting.model import simple_table
 from coliags_plugin.reporting.text_formats import markdown_table
 from coliags_plugin.results.comparisons import RivalComparison, compare_with_rivals, scene_means

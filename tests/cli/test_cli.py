@@ -311,7 +311,7 @@ def test_home_folder(tmp_path, janes, monkeypatch, capsys):
     with pytest.raises(InputError, match=str(tmp_path / "run")):
         report("~/run")  # was not evaluated
     (tmp_path / "bench.yaml").write_text("description: One scene\nscenes:\n  wall: {folder: ~/Jane Doe/scene}\n")
-    assert [str(source.path) for source in find_scenes(["~/bench.yaml"])] == [str(janes)]
+    assert [str(source.path) for source in find_scenes(["~/bench.yaml"], None)] == [str(janes)]
     refused(capsys, "data", "check", "~nobody-of-this-name/scene")
 
 

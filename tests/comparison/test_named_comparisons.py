@@ -12,7 +12,9 @@ import pytest
 from coliags_plugin.comparison.named_files import ABLATIONS, load_ablation, load_benchmark, shipped
 from coliags_plugin.comparison.scenes import find_scenes
 from coliags_plugin.config.method_config import descriptions, load_method
+from coliags_plugin.config.registry import phantom_layouts
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.phantom.generate import resolve
 
 
 @pytest.fixture
@@ -188,7 +190,8 @@ def test_another_phantom_in_the_place_of_the_benchmarks(tmp_path, written, chang
     (scene,) = find_scenes([name], tmp_path / "made")
     (tmp_path / "made" / "one").mkdir(parents=True)
     if changes is not None:
-        settings = {"settings": {**scene.phantom_record, **changes}}
+        made = resolve(scene.phantom, phantom_layouts.get(scene.phantom.layout)()).model_dump(mode="json")
+        settings = {"settings": {**made, **changes}}
         (tmp_path / "made" / "one" / "phantom.json").write_text(json.dumps(settings))
     with nullcontext() if message is None else pytest.raises(InputError, match=message):
         assert find_scenes([name], tmp_path / "made")[0].is_there

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from datetime import datetime, timezone
 from pathlib import Path
 
 import pytest
 
-from coliags_plugin.comparison.compare import make_request
+from coliags_plugin.comparison.compare import plan_cells
 from coliags_plugin.comparison.folder import ComparisonFolder
 from coliags_plugin.comparison.named_files import Variant
 from coliags_plugin.comparison.plan import make_cells
@@ -20,13 +19,12 @@ from coliags_plugin.phantom.settings import PhantomSettings
 from tests.scenes import write_wall
 
 
-def requested(wall, methods=("coliags",), *, steps=5, overrides=(), **options):
-    chosen = CompareOptions((wall,), Path("unused"), steps=steps, settings=tuple(overrides), **options)
-    return make_request(methods, chosen)
+def chosen(wall, *, steps=5, overrides=(), **options):
+    return CompareOptions((wall,), Path("unused"), steps=steps, settings=tuple(overrides), **options)
 
 
 def cells(wall, methods=("coliags",), **options):
-    return make_cells(requested(wall, methods, **options))
+    return plan_cells(methods, chosen(wall, **options))
 
 
 def planned(wall, **options):
@@ -76,14 +74,12 @@ def test_the_fingerprint_is_that_of_the_loaded_scene(wall):
 
 
 @pytest.mark.parametrize("layout", ["c3vd", "colmap"])
-def test_a_phantom_to_be_made_has_keys_where_its_fingerprint_is_known(tmp_path, layout):
-    phantom = PhantomSettings(layout=layout, frames=9)
-    request = requested(tmp_path)
-    request = replace(request, scenes=[SceneSource("planned", tmp_path / "planned", phantom=phantom)])
-    (unknown,) = make_cells(request)
-    assert unknown.fingerprint is None and unknown.config.schedule.steps == 5
-    (recorded,) = make_cells(request, lambda scene: "abc")
-    assert recorded.fingerprint == "abc" and recorded.planned.key
+def test_a_phantom_to_be_made_has_a_cell_without_a_key(tmp_path, layout):
+    source = SceneSource("planned", tmp_path / "planned", phantom=PhantomSettings(layout=layout, frames=9))
+    (cell,) = make_cells([Variant("coliags", "coliags")], [source], chosen(tmp_path))
+    assert cell.fingerprint is None and cell.config.schedule.steps == 5
+    with pytest.raises(ValueError, match="planned coliags seed 0: the scene is not there"):
+        _ = cell.planned
 
 
 @pytest.mark.parametrize(
@@ -110,22 +106,22 @@ def test_what_cannot_be_compared_is_refused(wall, options, message):
 
 def test_a_decision_is_recorded_when_the_plan_is_first_written(wall, tmp_path):
     folder = ComparisonFolder(tmp_path / "comparison")
-    first = requested(wall, ["coliags"], reference="coliags", primary=["psnr", "depth_mse_inner"])
+    first = chosen(wall, reference="coliags", primary=["psnr", "depth_mse_inner"])
     folder.check_extends(first)
     folder.path.mkdir()
-    folder.record(first, make_cells(first))
+    folder.record(first, cells(wall))
     decided = folder.plan().decided
     assert (decided.reference, decided.primary) == ("coliags", ("psnr", "depth_mse_inner"))
     assert decided.date == datetime.now(timezone.utc).date().isoformat()
     folder.check_extends(first)
     with pytest.raises(InputError, match="had decided coliags by psnr, depth_mse_inner when it was begun"):
-        folder.check_extends(requested(wall, ["coliags"], reference="coliags", primary=["psnr"]))
-    more = requested(wall, ["coliags", "3dgs"])
+        folder.check_extends(chosen(wall, reference="coliags", primary=["psnr"]))
+    more, both = chosen(wall), cells(wall, ["coliags", "3dgs"])
     folder.check_extends(more)
-    folder.record(more, make_cells(more))
+    folder.record(more, both)
     assert folder.plan().decided is not None
     assert [cell.method for cell in folder.plan().cells] == ["coliags", "3dgs"]
-    changed = make_cells(requested(wall, [Variant("coliags", "coliags", ("field.features=8",))]))
+    changed = cells(wall, [Variant("coliags", "coliags", ("field.features=8",))])
     folder.record(first, changed)
     assert folder.plan().cells[0].key == changed[0].planned.key
     (tmp_path / "late" / "results").mkdir(parents=True)
@@ -133,4 +129,4 @@ def test_a_decision_is_recorded_when_the_plan_is_first_written(wall, tmp_path):
     for _ in range(2):  # results alone, and a plan
         with pytest.raises(InputError, match="had decided nothing when it was begun"):
             late.check_extends(first)
-        late.record(more, make_cells(more))
+        late.record(more, both)

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from coliags_plugin.comparison.plan_file import PLAN_FILE, RESULTS, ComparisonPlan, read_plan
+from coliags_plugin.comparison.plan import PLAN_FILE, RESULTS, ComparisonPlan, read_plan
 from coliags_plugin.comparison.report.study import MissingResult, Study, StudyRun, grouped
 from coliags_plugin.core.errors import InputError, check_name
 from coliags_plugin.core.json_files import read_json
@@ -102,7 +102,7 @@ def _read_comparison(
     for cell in plan.cells if plan else ():
         if cell.protocol != protocol:
             continue
-        file, failure = folder / cell.result, folder / cell.failure
+        file, failure = folder / cell.result, folder / cell.failure_file
         if file.is_file():
             runs.append(replace(_read_file(file, file.stem), method=cell.method))
             if (folder / cell.run / "eval" / protocol / "renders").is_dir():

@@ -8,7 +8,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeVar
 
-from coliags_plugin.comparison.plan_file import Decision
+from coliags_plugin.comparison.plan import Decision
 from coliags_plugin.results.comparisons import BySeed
 from coliags_plugin.results.record import MAIN_SET, SEEN_SUFFIX, MetricRecord, ProtocolRecord, Result, SetRecord
 

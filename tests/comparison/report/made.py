@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from coliags_plugin.comparison.plan_file import Decision
+from coliags_plugin.comparison.plan import Decision
 from coliags_plugin.reporting.image_files import write_depth_tiff, write_png
 from coliags_plugin.results.reading import write_result
 from coliags_plugin.results.record import (
