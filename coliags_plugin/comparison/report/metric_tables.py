@@ -89,13 +89,12 @@ def metric_columns(test_set: TestSet, chosen: Sequence[str] = ()) -> list[Column
     ]
 
 
-def _table(study: Study, columns: Sequence[Column], cells: Mapping[str, Sequence[TableCell]], title: str) -> Table:
-    """Table of one row per method; cells of every method by the keys of the columns."""
-    rows: list[Mapping[str, Value | TableCell]] = [
+def _rows(study: Study, cells: Mapping[str, Sequence[TableCell]]) -> list[Mapping[str, Value | TableCell]]:
+    """Rows of a table, one per method, from the cells of every method by the keys of the columns."""
+    return [
         {METHOD.key: TableCell(method, style=index), **{key: column[index] for key, column in cells.items()}}
         for index, method in enumerate(study.methods)
     ]
-    return Table(title, [METHOD, *columns], rows)
 
 
 def shared_scenes(values: Mapping[str, BySeed]) -> list[str]:
@@ -131,17 +130,16 @@ def means_table(
     if any(mark for by_method in marks.values() for mark in by_method.values()):
         levels = ", ".join(f"{'*' * (index + 1)} p < {f'{level:g}'[1:]}" for index, level in enumerate(LEVELS))
         notes.append(f"Differs from the reference: {levels} (Wilcoxon signed-rank test over scenes, Holm)")
-    title = test_set.title if scene is None else f"{scene}, {test_set.title}"
-    table = _table(test_set.study, columns, cells, title)
-    rows = [*table.rows]
+    rows = _rows(test_set.study, cells)
     for method, numbers in published.methods.items() if published else ():
         label = TableCell(f"{method}, published", published=True)
         rows.append({METHOD.key: label, **{key: TableCell(text, float(text)) for key, text in numbers.items()}})
     frames = counted(sum(len(test_set.frames(each)) for each in scenes), "frame")
-    return replace(
-        table,
-        rows=rows,
-        notes=[*notes, published.note] if published else notes,
+    return Table(
+        test_set.title if scene is None else f"{scene}, {test_set.title}",
+        [METHOD, *columns],
+        rows,
+        [*notes, published.note] if published else notes,
         count=f"{counted(len(scenes), 'scene')}, {frames}" if len(scenes) > 1 else frames,
         name=f"summary-{test_set.name}" if scene is None else f"scene-{scene}-{test_set.name}",
     )
@@ -276,9 +274,11 @@ def cost_table(study: Study) -> Table:
         notes.append("To N dB: training time until the logged PSNR, smoothed, first reached N dB")
     notes.append("Rendering: views of the test sets a second. Gaussians: drawn in a test view, mean")
     plans = dict.fromkeys((run.method, run.result.provenance.get("training", {}).get("plan")) for run in study.runs)
-    return replace(
-        _table(study, columns, cells, "Costs"),
-        notes=notes + [f"{method}: {plan}" for method, plan in plans if plan],
+    return Table(
+        "Costs",
+        [METHOD, *columns],
+        _rows(study, cells),
+        notes + [f"{method}: {plan}" for method, plan in plans if plan],
         count=f"means over {counted(len(shared), 'scene')}" if len(shared) > 1 else "",
         name="costs",
     )

@@ -9,7 +9,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Shaped, UInt8
+from jaxtyping import Float, UInt8
 
 from coliags_plugin.comparison.report.metric_tables import metric_title
 from coliags_plugin.comparison.report.study import Study, StudyRun, TestSet, grouped
@@ -41,8 +41,6 @@ _SMALLEST_SCALE = 1e-6
 _SAMPLED = 20_000
 #: Metrics shown under an image, where available; the mean depth error stands for the mean squared one.
 _CAPTION_METRICS = ("psnr", "psnr_seen", "ssim", "ssim_seen", "depth_mae", "depth_mae_seen", "depth_mse")
-#: Metrics by which views can be sorted.
-_SORTED_BY = ("psnr", "ssim", "lpips", "depth_mse", "depth_mse_inner", "depth_median_error")
 
 #: A picture with its alternative text, or what is said instead of one.
 _Tile = tuple[EncodedImage | None, str]
@@ -57,11 +55,6 @@ class _Frame:
     position: int  # its index among the frames of the set
     name: str
     why: str  # why it is shown; empty for one of those spread along the video
-
-    def values(self, run: StudyRun) -> dict[str, float]:
-        """Metrics of one run, without those that the frame lacks."""
-        values = {name: each[self.position] for name, each in run.result.sets[self.test_set.set_name].values.items()}
-        return {name: value for name, value in values.items() if value is not None}
 
 
 def _choose_frames(study: Study, reference: str, count: int) -> Iterator[_Frame]:
@@ -121,15 +114,12 @@ class _View:
 
 def _read_view(frame: _Frame, runs: Sequence[StudyRun]) -> _View:
     """Read a frame of one or more runs of one scene, each with a run folder."""
-    whole_truth = _read(runs[0], "truth", frame)
-    factor = _reduction(whole_truth.shape[1])
-    truth = _reduced_rgb(whole_truth, factor)
+    truth = _read(runs[0], "truth", frame)
+    renders = [_read(run, "renders", frame) for run in runs]
 
     def depths(kind: str) -> list[Map | None]:
-        maps = (_read(run, kind, frame, whole_truth) for run in runs)
-        return [None if depth is None else _reduced_map(depth, factor) for depth in maps]
+        return [_read(run, kind, frame) for run in runs]
 
-    renders = [_reduced_rgb(_read(run, "renders", frame, whole_truth), factor) for run in runs]
     true_depth = next((depth for depth in depths("true_depth") if depth is not None), None)
     errors: list[Map | None] = [None]
     if true_depth is not None:
@@ -141,8 +131,8 @@ def _read_view(frame: _Frame, runs: Sequence[StudyRun]) -> _View:
     return _View(frame, truth, true_depth, [*renderings], of_depth)
 
 
-def _read(run: StudyRun, kind: str, frame: _Frame, like: Rgb | None = None) -> Any:
-    """An image of a run, of the size of the true one; None for depth that is not there."""
+def _read(run: StudyRun, kind: str, frame: _Frame) -> Any:
+    """An image of a run, reduced where it is large; None for depth that is not there."""
     reader, suffix = (read_depth_tiff, ".tiff") if kind.endswith("depth") else (read_rgb, ".png")
     assert run.evaluation is not None
     path = run.evaluation / kind / frame.test_set.set_name / f"{frame.name}{suffix}"
@@ -155,10 +145,13 @@ def _read(run: StudyRun, kind: str, frame: _Frame, like: Rgb | None = None) -> A
             f"Run `coliags eval {run.run} --protocol {run.result.protocol.name}` again",
         )
     pixels = reader(path)
-    if like is not None and pixels.shape[:2] != like.shape[:2]:
-        height, width = like.shape[:2]
-        raise InputError(f"{path} is {pixels.shape[1]} x {pixels.shape[0]} px", f"{width} x {height} px, as the truth")
-    return pixels
+    width, height = run.result.scene.size
+    if pixels.shape[:2] != (height, width):
+        raise InputError(f"{path} is {pixels.shape[1]} x {pixels.shape[0]} px", f"{width} x {height} px, as the others")
+    factor = _reduction(width)
+    # Averaging across an edge would mix depths of different surfaces.
+    interpolation = cv2.INTER_NEAREST_EXACT if suffix == ".tiff" else cv2.INTER_AREA
+    return cv2.resize(pixels, (width // factor, height // factor), interpolation=interpolation)
 
 
 def _depth_error(depth: Map, truth: Map) -> Map:
@@ -171,21 +164,8 @@ def _reduction(width: int) -> int:
     return math.ceil(width / _WIDEST)
 
 
-def _reduced_rgb(rgb: Rgb, factor: int) -> Rgb:
-    height, width = rgb.shape[0] // factor, rgb.shape[1] // factor
-    whole = np.ascontiguousarray(rgb[: height * factor, : width * factor])
-    return np.asarray(cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA))
-
-
-def _reduced_map(values: Shaped[np.ndarray, "H W"], factor: int) -> Shaped[np.ndarray, "h w"]:
-    """Subsampled map: averaging across an edge would mix depths of different surfaces."""
-    height, width = values.shape[0] // factor, values.shape[1] // factor
-    middle = factor // 2
-    return values[middle::factor, middle::factor][:height, :width]
-
-
 def view_section(study: Study, reference: str, count: int) -> Section:
-    """Section of held-out views, which can be sorted by the reference's metrics; says so where there are no images."""
+    """Section of held-out views; says so where there are no images."""
     if count < 1:
         raise InputError(f"{count} frames to show", "at least one")
     title, views = "Held-out views", list[_View]()
@@ -212,12 +192,11 @@ def view_section(study: Study, reference: str, count: int) -> Section:
         "bars": bars,
         "hatch": None if depth_limits is None else EncodedImage.webp(hatch(14, 34)),
         "reference": reference,
-        "orders": {name: metric_title(name) for name in _SORTED_BY if name in study.metrics},
         "scenes": [
             (
                 scene,
                 [
-                    (test_set.title, [_template_values(view, error_ends, depth_limits, reference) for view in same])
+                    (test_set.title, [_template_values(view, error_ends, depth_limits) for view in same])
                     for test_set, same in grouped(in_scene, lambda view: view.frame.test_set).items()
                 ],
             )
@@ -254,13 +233,9 @@ def _scales(views: Sequence[_View]) -> tuple[dict[bool, float], tuple[float, flo
 
 
 def _template_values(
-    view: _View, error_ends: Mapping[bool, float], depth_limits: tuple[float, float] | None, reference: str
+    view: _View, error_ends: Mapping[bool, float], depth_limits: tuple[float, float] | None
 ) -> dict[str, Any]:
-    """Values of a view for the template.
-
-    The script sorts by ``data``: the position along the video, and for each metric a number that is larger the worse
-    the reference is.
-    """
+    """Values of a view for the template."""
     frame, where = view.frame, f"frame {view.frame.name}"
     study, test_set = frame.test_set.study, frame.test_set
     truth = EncodedImage.jpeg(view.truth)
@@ -285,18 +260,11 @@ def _template_values(
                 drawn = colorize_depth(rendering.expected, depth_limits, hatched=True)
                 tiles.append((EncodedImage.webp(drawn), f"{where}, expected depth of {name}"))
         cells.append((name, study.methods.index(name), tiles, _caption(frame, rendering.run)))
-    runs = test_set.evaluated(reference, frame.scene)
-    values = frame.values(runs[0][0]) if runs else {}
-    signs = {name: -1.0 if study.metrics[name].direction == "higher" else 1.0 for name in values}
     count = f"{frame.position + 1} of {len(test_set.frames(frame.scene))}"
     return {
         "title": f"{frame.scene} · {test_set.set_name} · {frame.name}",
         "where": where,
         "count": f"{count} · {frame.why}" if frame.why else count,
-        "data": {
-            "position": frame.position,
-            **{name.replace("_", "-"): signs[name] * values[name] for name in _SORTED_BY if name in values},
-        },
         "size": truth,
         "in_row": view.in_row,
         "cells": cells,
@@ -304,11 +272,12 @@ def _template_values(
 
 
 def _caption(frame: _Frame, run: StudyRun) -> list[str]:
-    values, texts = frame.values(run), []
+    columns, texts = run.result.sets[frame.test_set.set_name].values, []
+    values = {name: column[frame.position] for name, column in columns.items()}
     for name in _CAPTION_METRICS:
-        if name in values and not (name == "depth_mse" and "depth_mae" in values):
+        if (value := values.get(name)) is not None and (name != "depth_mse" or values.get("depth_mae") is None):
             unit = frame.test_set.study.metrics[name].unit
-            number = number_text(values[name], column_decimals(unit, [values[name]]))
+            number = number_text(value, column_decimals(unit, [value]))
             texts.append(f"{metric_title(name)} {number} {unit_text(unit)}".rstrip())
     return texts or ["no metrics for this frame"]
 

@@ -112,22 +112,6 @@
     choose();
   }
 
-  // ---- Order of the views.
-
-  function viewSorter(paragraph) {
-    const select = paragraph.querySelector("select");
-    const nameOf = (metric) => metric.replace(/_(\w)/g, (_, letter) => letter.toUpperCase());
-    select.addEventListener("change", () => {
-      const key = select.value ? nameOf(select.value) : "position";
-      const sign = select.value ? -1 : 1;
-      const number = (view) => (view.dataset[key] === undefined ? Infinity : sign * Number(view.dataset[key]));
-      for (const list of all(".views")) {
-        list.append(...[...list.children].sort((one, other) => number(one) - number(other)));
-      }
-    });
-    paragraph.hidden = false;
-  }
-
   // ---- Slider between two methods.
 
   function comparator(box) {
@@ -242,7 +226,6 @@
     if (own.some((table) => table.querySelector("th[hidden]"))) chooser(own);
   }
   all("[data-switch=curves]").forEach(curveSwitch);
-  all(".sorter").forEach(viewSorter);
   all(".compare").forEach(comparator);
   all("details.scene").forEach(scene);
   all(".scenes").forEach(scenes);

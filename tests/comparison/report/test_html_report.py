@@ -139,9 +139,6 @@ def test_views_are_spread_over_each_set_and_the_worst_are_among_them(tmp_path):
         ("0100", "1 of 2", "worst PSNR and Depth MSE of coliags"),
         ("0110", "2 of 2", ""),
     ]
-    views = [attributes for attributes in page.all("article") if attributes["class"] == "frame"]
-    assert [float(view["data-psnr"]) for view in views[:4]] == [-30.0, -29.0, -20.0, -30.0]
-    assert [float(view["data-depth-mse"]) for view in views[:4]] == [0.1, 0.5, 0.1, 0.1]
     # truth, its depth, a rendering and its error; two of the slider; and the sample of the hatch
     assert len(page.all("img")) == 6 * 4 + 2 + 1
 
@@ -346,7 +343,7 @@ def test_what_is_missing_is_refused(tmp_path, two_runs):
         (
             "renders/test/0004.png",
             EncodedImage.png(np.zeros((5, 6, 3), np.uint8)).data,
-            r"6 x 5 px\. Expected 16 x 12 px, as the truth",
+            r"6 x 5 px\. Expected 16 x 12 px, as the others",
         ),
     ],
 )

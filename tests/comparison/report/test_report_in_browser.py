@@ -172,23 +172,6 @@ def test_methods_frames_and_errors_are_chosen(opened):
     assert opened.run("document.activeElement.type") == "range"
 
 
-def positions(browser):
-    return browser.run("[...document.querySelector('.views').children].map(view => Number(view.dataset.position))")
-
-
-def test_the_worst_views_come_first_on_demand(opened):
-    along = positions(opened)
-    assert along == sorted(along)
-    sort = "(value => { const s = document.querySelector('[data-sort]'); s.value = value;" \
-        " s.dispatchEvent(new Event('change')); })"  # fmt: skip
-    opened.run(f"{sort}('psnr')")
-    psnr = [30.0, 29.0, 31.0, 20.0, 32.0]
-    assert positions(opened) == sorted(along, key=lambda position: psnr[position])
-    assert positions(opened)[0] == 3
-    opened.run(f"{sort}('')")
-    assert positions(opened) == along
-
-
 def curves(browser):
     """Numbers of visible charts against steps, and against seconds."""
     visible = "document.querySelectorAll('figure.{}').values().filter(each => each.checkVisibility()).toArray().length"
@@ -214,7 +197,6 @@ def test_without_scripts_all_is_there_but_the_choices(browser, page):
     browser.open(page, PHONE, phone=True, scripts=False)
     browser._call("Emulation.setScriptExecutionDisabled", value=False)
     assert browser.run("document.querySelector('.compare').checkVisibility()") is False
-    assert browser.run("document.querySelector('.sorter').checkVisibility()") is False
     assert browser.run("document.querySelectorAll('thead button, .chooser').length") == 0
     assert shown_columns(browser, "summary-test")[:2] == ["psnr", "ssim"]
     assert browser.run("document.querySelector('article.frame img').checkVisibility()")
