@@ -139,20 +139,18 @@ def frame_charts(study: Study) -> list[Folded]:
     """PSNR of each frame of every scene."""
     folded = []
     for scene in study.scenes:
-        charts = [chart for each in study.test_sets if (chart := _frame_chart(each, scene)).has_points]
-        if charts:
+        charts = []
+        for test_set in study.test_sets:
+            names, lines = list(test_set.frames(scene)), []
+            for style, method in enumerate(study.methods):
+                values = test_set.frame_means(scene, method, "psnr")
+                psnr = [values.get(name, math.nan) for name in names]
+                lines.append(Series(method, style, [*map(float, range(len(names)))], psnr))
+            charts.append(Chart(lines, "frame", "PSNR [dB]", test_set.title, x_names=names, markers=True))
+        if charts := [chart for chart in charts if chart.has_points]:
             figures = Figures(charts, legend=study.methods)
             folded.append(Folded(f"PSNR of each frame of {scene}", [figures], is_open=len(study.scenes) == 1))
     return folded
-
-
-def _frame_chart(test_set: TestSet, scene: str) -> Chart:
-    names, lines = list(test_set.frames(scene)), []
-    for style, method in enumerate(test_set.study.methods):
-        if values := test_set.frame_means(scene, method, "psnr"):
-            along = [float(index) for index in range(len(names))]
-            lines.append(Series(method, style, along, [values.get(name, math.nan) for name in names]))
-    return Chart(lines, "frame", "PSNR [dB]", test_set.title, x_names=names, markers=True)
 
 
 def _chart(lines: Sequence[Series], x_label: str, y_label: str, title: str, log_from: float, **options: Any) -> Chart:

@@ -9,7 +9,7 @@ from operator import attrgetter
 import numpy as np
 
 from coliags_plugin.comparison.report.published import published_for
-from coliags_plugin.comparison.report.study import Study, TestSet, grouped
+from coliags_plugin.comparison.report.study import Study, StudyRun, TestSet, grouped
 from coliags_plugin.core.errors import check_name
 from coliags_plugin.reporting.model import Column, Table, TableCell, Value, ranked_cells
 from coliags_plugin.reporting.numbers import column_decimals, counted, duration, number_text, unit_text
@@ -71,7 +71,7 @@ def metric_columns(test_set: TestSet, chosen: Sequence[str] = ()) -> list[Column
     Chosen ones come first, in their order. Unless chosen, metrics that have no value in the set, nor a published one,
     are not shown either.
     """
-    metrics, published = test_set.study.metrics, published_for(test_set)
+    metrics, (published, _) = test_set.study.metrics, published_for(test_set)
     available = {name for name in metrics if test_set.has(name)}
     elsewhere = {name for name in metrics if any(other.has(name) for other in test_set.study.test_sets)} - available
     names = [name for name in metrics if not name.endswith(SEEN_SUFFIX) or name not in elsewhere]
@@ -80,7 +80,7 @@ def metric_columns(test_set: TestSet, chosen: Sequence[str] = ()) -> list[Column
         usual = [
             _INSTEAD[name] if name not in available and _INSTEAD.get(name) in available else name for name in usual
         ]
-        printed = set() if published is None else {name for row in published.methods.values() for name in row}
+        printed = {name for row in published.values() for name in row}
         chosen = [name for name in usual if name in available | printed]
     shown = names if ALL_COLUMNS in chosen else [name for name in chosen if name in names]
     return [
@@ -121,7 +121,7 @@ def means_table(
 
     Stars are by metric and method; published numbers stand below our means over all scenes.
     """
-    published = published_for(test_set) if scene is None else None
+    published, source = published_for(test_set) if scene is None else ({}, "")
     scenes, marks = test_set.scenes if scene is None else [scene], stars or {}
     cells = {column.key: _metric_cells(test_set, column, scenes, marks.get(column.key, {})) for column in columns}
     notes = [] if scene is not None else _summary_notes(test_set, columns)
@@ -131,7 +131,7 @@ def means_table(
         levels = ", ".join(f"{'*' * (index + 1)} p < {f'{level:g}'[1:]}" for index, level in enumerate(LEVELS))
         notes.append(f"Differs from the reference: {levels} (Wilcoxon signed-rank test over scenes, Holm)")
     rows = _rows(test_set.study, cells)
-    for method, numbers in published.methods.items() if published else ():
+    for method, numbers in published.items():
         label = TableCell(f"{method}, published", published=True)
         rows.append({METHOD.key: label, **{key: TableCell(text, float(text)) for key, text in numbers.items()}})
     frames = counted(sum(len(test_set.frames(each)) for each in scenes), "frame")
@@ -139,7 +139,7 @@ def means_table(
         test_set.title if scene is None else f"{scene}, {test_set.title}",
         [METHOD, *columns],
         rows,
-        [*notes, published.note] if published else notes,
+        [*notes, source] if source else notes,
         count=f"{counted(len(scenes), 'scene')}, {frames}" if len(scenes) > 1 else frames,
         name=f"summary-{test_set.name}" if scene is None else f"scene-{scene}-{test_set.name}",
     )
@@ -224,7 +224,7 @@ def _titles(columns: Sequence[Column]) -> str:
 
 # Costs
 
-#: Largest number of PSNR marks.
+#: PSNR marks that are shown: the highest that a method reached.
 _MARKS_SHOWN = 3
 
 
@@ -247,19 +247,12 @@ def cost_table(study: Study) -> Table:
     mixed = [work for work, names in devices.items() if len(names) > 1]
     marks = [_mark(name) for name in sorted({name for cost in costs for name in cost.seconds_to_psnr}, key=float)]
     shown = [replace(cost, direction=None) if cost.work in mixed else cost for cost in (*COSTS[:2], *marks, *COSTS[2:])]
-    cells = {"steps": [_steps(study, method) for method in study.methods]}
+    cells = {"steps": [_steps(runs) for runs in study.by_method.values()]}
     cells |= {cost.key: _cost_cells(study, shared, cost) for cost in shown}
-    # The highest marks that all methods reached, then the lowest that some did.
-    reached = {mark.key: [bool(cell.text) for cell in cells[mark.key]] for mark in marks}
-    by_all = [key for key in reversed(reached) if all(reached[key])]
-    by_some = [key for key in reached if any(reached[key]) and key not in by_all]
-    hidden = reached.keys() - {*[*by_all, *by_some][:_MARKS_SHOWN]}
+    reached = [mark.key for mark in marks if any(cell.text for cell in cells[mark.key])]
+    hidden = {mark.key for mark in marks} - {*reached[-_MARKS_SHOWN:]}
     columns = [Column("steps", "Steps")]
     columns += [Column(cost.key, cost.title, cost.unit, cost.direction, cost.key not in hidden) for cost in shown]
-    if "training" in mixed:
-        columns.append(Column("device", "Device", words=True))
-        used = ([training_device(run.result.cost) for run in runs] for runs in study.by_method.values())
-        cells["device"] = [TableCell("; ".join(dict.fromkeys(names))) for names in used]
     notes = []
     if len(shared) < len(study.scenes):
         missing = ", ".join(scene for scene in study.scenes if scene not in shared)
@@ -284,9 +277,9 @@ def cost_table(study: Study) -> Table:
     )
 
 
-def _steps(study: Study, method: str) -> TableCell:
-    steps = sorted({run.result.steps for run in study.by_method[method]})
-    return TableCell(f"{steps[0]:,}" if len(steps) == 1 else f"{steps[0]:,} to {steps[-1]:,}", steps[-1])
+def _steps(runs: Sequence[StudyRun]) -> TableCell:
+    steps = sorted({run.result.steps for run in runs})
+    return TableCell(" to ".join(f"{end:,}" for end in dict.fromkeys((steps[0], steps[-1]))), steps[-1])
 
 
 def _cost_cells(study: Study, shared: Sequence[str], cost: Cost) -> list[TableCell]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 from coliags_plugin.comparison.report.study import TestSet
 from coliags_plugin.results.record import MAIN_SET
@@ -39,30 +38,17 @@ _ENDOGSLAM_SEQUENCES = 10
 _ROTATECOLON_FRAMES = (381, 223)
 
 
-@dataclass(frozen=True)
-class PublishedBenchmark:
-    """Means over a benchmark's scenes as printed in the paper of ColIAGS."""
+def published_for(test_set: TestSet) -> tuple[dict[str, dict[str, str]], str]:
+    """Printed means of the benchmark that a test set is, by method and metric, and their source as a sentence.
 
-    title: str
-    methods: Mapping[str, Mapping[str, str]]  # printed numbers by method and metric
-
-    @property
-    def note(self) -> str:
-        """Source of the numbers, as a sentence."""
-        return (
-            f"published: as printed in the paper of ColIAGS for {self.title}, trained and evaluated by its authors; "
-            "not ranked with ours"
-        )
-
-
-def published_for(test_set: TestSet) -> PublishedBenchmark | None:
-    """Published numbers of the benchmark that a test set is; None where it is another, or not all of it."""
+    Both are empty where it is another, or not all of it.
+    """
     by_name = {run.scene: run.result for run, _ in test_set.records}
     scenes = [*by_name.values()]
     dataset, *others = {str(run.data.get("dataset")) for run, _ in test_set.records}
     key, are_different = (dataset, test_set.split), len({result.scene.fingerprint for result in scenes}) == len(scenes)
     if test_set.set_name != MAIN_SET or others or not are_different or key not in _BENCHMARKS:
-        return None
+        return {}, ""
     frames = [(len(result.scene.train), len(result.sets[MAIN_SET].frames)) for result in scenes]  # training, test
     is_whole = {
         "c3vd": {result.scene.size for result in scenes} == {_C3VD_SIZE}
@@ -71,13 +57,12 @@ def published_for(test_set: TestSet) -> PublishedBenchmark | None:
         "rotatecolon": frames == [_ROTATECOLON_FRAMES],
     }
     if not is_whole[dataset]:
-        return None
+        return {}, ""
     title, metrics, first = _BENCHMARKS[key]
     rows = [line.split() for line in _PRINTED.split("\n") if line]
-    return PublishedBenchmark(
-        title,
-        {
-            name.replace("Gaussian-", "Gaussian "): dict(zip(metrics, numbers[first:], strict=False))
-            for name, *numbers in rows
-        },
+    means = {name.replace("Gaussian-", "Gaussian "): numbers[first:] for name, *numbers in rows}
+    return (
+        {method: dict(zip(metrics, numbers, strict=False)) for method, numbers in means.items()},
+        f"published: as printed in the paper of ColIAGS for {title}, trained and evaluated by its authors; not ranked "
+        "with ours",
     )

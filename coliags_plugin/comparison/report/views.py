@@ -75,11 +75,9 @@ def _choose_frames(study: Study, reference: str, count: int) -> Iterator[_Frame]
 
 def evenly(length: int, count: int) -> list[int]:
     """``count`` evenly spaced indices below ``length``, first and last included; the middle one if ``count`` is 1."""
-    if count >= length:
-        return list(range(length))
     if count == 1:
         return [length // 2]
-    return [round(index * (length - 1) / (count - 1)) for index in range(count)]
+    return [round(index) for index in np.linspace(0, length - 1, min(count, length)).tolist()]
 
 
 @dataclass(frozen=True)
