@@ -115,8 +115,9 @@ class TestSet:
 
     def evaluated(self, method: str, scene: str | None = None) -> list[tuple[StudyRun, SetRecord]]:
         """Runs of a method with their records, by seed; of one scene, or all."""
-        evaluated = [each for each in self.records if each[0].method == method and scene in (None, each[0].scene)]
-        return sorted(evaluated, key=lambda each: each[0].result.seed)
+        evaluated = grouped(self.records, lambda each: each[0].method).get(method, [])
+        by_seed = sorted(evaluated, key=lambda each: each[0].result.seed)
+        return [each for each in by_seed if scene in (None, each[0].scene)]
 
     def frames(self, scene: str) -> Sequence[str]:
         """Names of a scene's frames, the same for every method."""
