@@ -19,32 +19,12 @@ from coliags_plugin.core.ssim import ssim_map
 from coliags_plugin.core.tensors import fixed_uniform, interpolated, masked_mean, weighted_mean, zero_outside
 
 
-class PhotometricSettings(LossSettings):
-    """Options of the losses between images that can leave out what is not the wall."""
-
-    # multiple of the frame's median residual above which pixels lose weight; null: all count alike
-    outliers: float | None = Field(default=None, gt=0.0)
-    outliers_from: int = Field(default=2000, ge=0)  # step after which they do; scales with the run
-
-
-class PhotometricLoss(Loss[PhotometricSettings]):
-    """Weighted mean over the valid pixels and channels of a difference between images."""
-
-    def mean(self, values: Float[Tensor, "H W 3"], step: TrainingStep) -> Float[Tensor, ""]:
-        """Mean of the values, weighted by :func:`wall_weights` once they count."""
-        settings, target = self.settings, step.target
-        if settings.outliers is None or step.step <= step.schedule.at(settings.outliers_from):
-            return masked_mean(values, target.mask)
-        weights = wall_weights(_difference(step.output.rgb, target), target.valid, settings.outliers)
-        return weighted_mean(values.mean(-1), target.valid, weights)
-
-
-class L1Loss(PhotometricLoss):
+class L1Loss(Loss):
     """Mean absolute difference over valid pixels and channels (the paper's L_1; docs/methods.md 4.1)."""
 
     def __call__(self, step: TrainingStep) -> Float[Tensor, ""]:
         """The unweighted term, in units of full scale; 0 where no pixel is valid."""
-        return self.mean(_difference(step.output.rgb, step.target).abs(), step)
+        return masked_mean(_difference(step.output.rgb, step.target).abs(), step.target.mask)
 
 
 class MSESettings(LossSettings):
@@ -66,7 +46,7 @@ class MSELoss(Loss[MSESettings]):
         return masked_mean(_difference(step.output[self.settings.image], step.target).square(), step.target.mask)
 
 
-class DSSIMLoss(PhotometricLoss):
+class DSSIMLoss(Loss):
     """1 - SSIM over valid pixels (the paper's L_D-SSIM; docs/methods.md 2.4, 4.1).
 
     Ignored pixels do not enter the windows either, see :func:`coliags_plugin.core.ssim.ssim_map`.
@@ -76,28 +56,8 @@ class DSSIMLoss(PhotometricLoss):
 
     def __call__(self, step: TrainingStep) -> Float[Tensor, ""]:
         """The unweighted term, from 0 (equal) to 2; 0 where no pixel is valid."""
-        rgb = step.output.rgb
-        return self.mean(1.0 - ssim_map(rgb, step.target.rgb.to(rgb.dtype), step.target.mask), step)
-
-
-@torch.no_grad()
-def wall_weights(
-    difference: Float[Tensor, "H W 3"], valid: Bool[Tensor, "H W"], outliers: float
-) -> Float[Tensor, "H W"]:
-    """Weight of every pixel by how well the rendering explains it, in (0, 1] (docs/methods.md 4.11).
-
-    With e the mean absolute difference in 5x5 pixels, and m its median over the valid pixels: 1 up to ``outliers`` m,
-    beyond it the square of ``outliers`` m / e. The rendering is what the frames agree on, so that a tool, which other
-    frames do not show there, has large e.
-    """
-    error = difference.abs().mean(-1)[None, None]
-    inside = valid.to(error.dtype)[None, None]
-    near, counted = (functional.avg_pool2d(values, 5, 1, 2) for values in (error * inside, inside))
-    smooth = (near / counted.clamp_min(1e-6))[0, 0]
-    # NaN, where no pixel is valid.
-    median = torch.where(valid, smooth, torch.nan).flatten().nanmedian(0).values
-    limit = outliers * median.clamp_min(1.0 / 255.0)
-    return torch.where(valid.any(), (limit / smooth.clamp_min(1e-6)).clamp_max(1.0).square(), 1.0)
+        rgb, mask = step.output.rgb, step.target.mask
+        return masked_mean(1.0 - ssim_map(rgb, step.target.rgb.to(rgb.dtype), mask), mask)
 
 
 def _difference(rgb: Float[Tensor, "H W 3"], target: Target) -> Float[Tensor, "H W 3"]:
@@ -248,7 +208,8 @@ class EstimatedDepthLoss(Loss[EstimatedDepthSettings]):
         rendered, options = step.output[self.settings.depth], self.settings
         estimate = torch.where(has_depth, depth, 1.0).to(rendered.dtype)
         rendered, has_depth = _where_drawn(rendered, has_depth, options.depth)
-        penalty = _smooth_l1((zero_outside(rendered - estimate, has_depth) / estimate).abs(), options.delta)
+        relative = (zero_outside(rendered - estimate, has_depth) / estimate).abs()
+        penalty = functional.smooth_l1_loss(relative, torch.zeros_like(relative), reduction="none", beta=options.delta)
         if step.target.depth_confidence is not None:
             penalty = penalty * step.target.depth_confidence.to(penalty.dtype).clamp_min(options.floor)
         return masked_mean(penalty, has_depth)
@@ -258,8 +219,6 @@ class SparseDepthSettings(LossSettings):
     """Options of the sparse depth loss."""
 
     depth: DepthKind = "depth_expected"  # rendered depth that is compared; depth_median has no gradient
-    # Huber threshold, of the differences' unit: smaller ones are squared and divided by twice this; null: no threshold
-    huber: float | None = Field(default=None, gt=0.0)
     relative: bool = False  # differences are divided by the known depth, so that the weight needs no unit of length
     # what a point adds at most, of the differences' unit: x becomes bound (1 - exp(-x / bound)), whose slope falls from
     # 1 to 0, so that outliers hardly pull; null: x itself
@@ -296,8 +255,6 @@ class SparseDepthLoss(Loss[SparseDepthSettings]):
         difference = torch.where(counts, sampled - truth, 0.0).abs()
         if self.settings.relative:
             difference = difference / torch.where(counts, truth, 1.0)
-        if self.settings.huber is not None:
-            difference = _smooth_l1(difference, self.settings.huber)
         if self.settings.bound is not None:
             difference = -self.settings.bound * torch.expm1(-difference / self.settings.bound)
         return difference.sum() / counts.sum().clamp_min(1)
@@ -327,8 +284,3 @@ def _where_drawn(
 def _reciprocal(values: Float[Tensor, "H W"], where: Bool[Tensor, "H W"], otherwise: float) -> Float[Tensor, "H W"]:
     """1/E; both operands are masked so that no gradient becomes NaN."""
     return torch.where(where, 1.0 / torch.where(where, values, 1.0), otherwise)
-
-
-def _smooth_l1(differences: Float[Tensor, "*N"], beta: float) -> Float[Tensor, "*N"]:
-    """Huber's function of slope 1: x^2 / (2 beta) for |x| up to ``beta``, beyond it |x| - beta / 2."""
-    return functional.smooth_l1_loss(differences, torch.zeros_like(differences), reduction="none", beta=beta)

@@ -66,7 +66,6 @@ class LPIPSSettings(Settings):
     net: Literal["vgg", "alex", "squeeze"] = "vgg"  # the backbone
     # of the network, which was trained on minus-one-one; the splatting papers, this one included, feed [0, 1] unmapped
     input_range: Literal["zero-one", "minus-one-one"] = "zero-one"
-    weights: str | None = None  # a folder searched for weights before the default ones
 
 
 class LPIPS(Metric[LPIPSSettings]):
@@ -79,20 +78,13 @@ class LPIPS(Metric[LPIPSSettings]):
     higher_is_better: ClassVar[bool] = False
     unit: ClassVar[str] = ""
 
-    def __init__(self, settings: LPIPSSettings) -> None:
-        super().__init__(settings)
-        if settings.weights is not None and not user_path(settings.weights).is_dir():
-            raise InputError(f"lpips: weights = '{settings.weights}' is not a folder", "a folder with LPIPS weights")
-
     def __call__(self, comparison: Comparison) -> float:
         """LPIPS of one frame, 0 for equal images; unavailable without weights, and for small or unusable images."""
         require_image(comparison)
         height, width = comparison.valid.shape
         if min(height, width) < _SMALLEST:
             raise UnavailableError(f"LPIPS needs at least {_SMALLEST} pixels a side, the image is {width}x{height}")
-        network = _network(
-            self.settings.net, *find_weights(self.settings.net, self.settings.weights), comparison.rgb.device
-        )
+        network = _network(self.settings.net, *find_weights(self.settings.net), comparison.rgb.device)
         with torch.no_grad():
             first, second = self._input(comparison.rgb, comparison), self._input(comparison.true_rgb, comparison)
             return float(network(first, second, comparison.valid))
@@ -223,7 +215,7 @@ class Fire(nn.Module):
 # --- weights --------------------------------------------------------------------------------------------------------
 
 
-def find_weights(net: str, folder: str | Path | None = None) -> tuple[Path, Path]:
+def find_weights(net: str, folder: Path | None = None) -> tuple[Path, Path]:
     """Paths of the backbone and linear head weights.
 
     Searched in :func:`searched_folders`. Where one is missing, UnavailableError names it and the command that installs
@@ -241,7 +233,7 @@ def find_weights(net: str, folder: str | Path | None = None) -> tuple[Path, Path
     return backbone, heads
 
 
-def searched_folders(folder: str | Path | None = None) -> list[Path]:
+def searched_folders(folder: Path | None = None) -> list[Path]:
     """Folders in which weights are searched for: this one, that of ``COLIAGS_LPIPS_WEIGHTS``, and torch's downloads."""
     named = [user_path(path) for path in (folder, os.environ.get(WEIGHTS_VARIABLE)) if path]
     return [*named, default_folder()]

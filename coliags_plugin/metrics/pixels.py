@@ -13,7 +13,7 @@ from torch import Tensor
 
 from coliags_plugin.contracts import Comparison, Metric
 from coliags_plugin.core.errors import UnavailableError
-from coliags_plugin.core.settings import Settings, SettingsT
+from coliags_plugin.core.settings import Settings
 from coliags_plugin.core.ssim import ssim
 
 
@@ -70,7 +70,7 @@ def require_image(comparison: Comparison) -> None:
         raise UnavailableError(f"the rendered image is not finite at {int(broken)} pixels")
 
 
-class DepthMetric(Metric[SettingsT]):
+class DepthMetric(Metric):
     """Base class of the depth metrics: pixel selection and the reasons for an unavailable value."""
 
     higher_is_better: ClassVar[bool] = False
@@ -100,7 +100,7 @@ class DepthMetric(Metric[SettingsT]):
         """The metric over the selected pixels, whose depths are in mm."""
 
 
-class DepthMSE(DepthMetric[SettingsT]):
+class DepthMSE(DepthMetric):
     """Mean squared error, the paper's Depth MSE.
 
     Dominated by the few pixels beside depth steps; read it together with the other depth metrics.
@@ -113,20 +113,17 @@ class DepthMSE(DepthMetric[SettingsT]):
         return (rendered - truth).square().mean()
 
 
-class DepthMSEInnerSettings(Settings):
-    """Threshold of a depth step, and the width of the margin left out around it."""
-
-    relative_step: float = Field(default=0.12, gt=0.0)  # (max - min) / min of a 3x3 window of true depth
-    margin: int = Field(default=2, ge=0)  # pixels up to this many rows and columns from a step are left out
-
-
-class DepthMSEInner(DepthMSE[DepthMSEInnerSettings]):
+class DepthMSEInner(DepthMSE):
     """Mean squared error of the pixels away from depth steps, so without silhouettes."""
+
+    #: (max - min) / min of a 3x3 window of true depth that is a step, and pixels left out on either side of one.
+    relative_step: ClassVar[float] = 0.12
+    margin: ClassVar[int] = 2
 
     def select(self, truth: Float[Tensor, "H W"], counts: Bool[Tensor, "H W"]) -> Bool[Tensor, "H W"]:
         """Valid pixels further than ``margin`` from any depth step."""
-        steps = depth_steps(truth, counts, self.settings.relative_step)
-        inner = counts & ~dilated(steps, self.settings.margin)
+        steps = depth_steps(truth, counts, self.relative_step)
+        inner = counts & ~dilated(steps, self.margin)
         if not inner.any():
             raise UnavailableError("all pixels of this frame are near depth steps")
         return inner

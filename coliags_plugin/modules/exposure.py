@@ -141,9 +141,7 @@ class Metering(nn.Module):
 class FrameGainSettings(Settings):
     """Options of the gain per frame."""
 
-    reference: str | None = None  # training frame whose gain is 1; None: the gains' geometric mean is 1
-    # between the neighbours in time, that corrected for brightness, or the mean gain
-    untrained: Literal["interpolate", "metered", "mean"] = "interpolate"
+    untrained: Literal["interpolate", "metered"] = "interpolate"  # between neighbours in time, or that metered
     channels: Literal[1, 3] = 1  # one gain for all colours, or one each, for a white balance that drifts
     # 1, or fitted to surface points where there is depth (docs/methods.md 4.8)
     initial: Literal["one", "points"] = "one"
@@ -154,11 +152,11 @@ class FrameGainSettings(Settings):
 class FrameGain(ViewModule[FrameGainSettings]):
     """Learned factor on the rendered colours for each training frame.
 
-    Colours and gains are only known up to a common factor, which ``reference`` settles. Free cameras have the mean
-    gain; views of test sets beside the video have that of the training frame taken closest to them.
+    Colours and gains are only known up to a common factor: the gains' geometric mean is 1. Free cameras have that;
+    views of test sets beside the video have the gain of the training frame taken closest to them.
 
     Attributes:
-        log_gain: Logarithm for every training frame, before the reference is subtracted: all of it, or, over ``rate``,
+        log_gain: Logarithm for every training frame, before the mean is subtracted: all of it, or, over ``rate``,
             what is added to the fitted one. [F, C]
         fitted: Fitted logarithm; 0 where none is. [F, C]
         rate: Share of the learning rate. []
@@ -171,7 +169,6 @@ class FrameGain(ViewModule[FrameGainSettings]):
         super().__init__()
         self.settings = settings
         self.frames = FrameRows(scene)
-        self._reference = None if settings.reference is None else self.frames.require(settings.reference, "gain")
         self.metering = Metering(scene, self.frames) if settings.untrained == "metered" else None
         self.log_gain = nn.Parameter(torch.zeros(len(self.frames), settings.channels))
         self.register_buffer("fitted", torch.zeros_like(self.log_gain))
@@ -188,8 +185,6 @@ class FrameGain(ViewModule[FrameGainSettings]):
     @property
     def untrained_views(self) -> str:
         """Gain of views that are not training frames."""
-        if self.settings.untrained == "mean":
-            return "views without training have the mean gain of the training frames"
         corrected = "" if self.metering is None else " and corrected for their brightness, as automatic exposure does"
         return (
             f"views without training have a gain interpolated in time between the training frames around them"
@@ -206,10 +201,9 @@ class FrameGain(ViewModule[FrameGainSettings]):
         return self.frames.times, self.log_gains()
 
     def log_gains(self) -> Float[Tensor, "F C"]:
-        """Logarithm of every training frame's gain, relative to the reference, within its bounds."""
+        """Logarithm of every training frame's gain, relative to the mean, within its bounds."""
         logs = self.fitted + self.rate * self.log_gain
-        zero = logs.mean(0) if self._reference is None else logs[self._reference]
-        return self._bounded(logs - zero)
+        return self._bounded(logs - logs.mean(0))
 
     def _bounded(self, log_gains: Float[Tensor, "*S"]) -> Float[Tensor, "*S"]:
         limit = math.log(self.settings.max_gain)
@@ -222,7 +216,7 @@ class FrameGain(ViewModule[FrameGainSettings]):
     def gain(self, view: View | None) -> Float[Tensor, "C"]:
         """The gain of a view."""
         log_gains = self.log_gains()
-        if view is None or (self.frames.row(view) is None and self.settings.untrained == "mean"):
+        if view is None:
             return log_gains.mean(0).exp()
         return self._bounded(self.frames.smoothed(log_gains, view)).exp()
 

@@ -10,7 +10,6 @@ from jaxtyping import Float
 from scipy.interpolate import Akima1DInterpolator
 from torch import Tensor
 
-from coliags_plugin.core.errors import InputError, did_you_mean
 from coliags_plugin.core.scenes import Scene, View
 
 
@@ -23,7 +22,6 @@ class FrameRows:
     def __init__(self, scene: Scene) -> None:
         self.rows: Mapping[str, int] = {frame.name: row for row, frame in enumerate(scene.train)}
         self.times = [float(frame.index) for frame in scene.train]
-        self._held_out = {frame.name for frames in scene.test_sets.values() for frame in frames}
         by_time = sorted((time, row) for row, time in enumerate(self.times))
         self._sorted_times = [time for time, _ in by_time]
         self._rows_by_time = [row for _, row in by_time]
@@ -76,18 +74,6 @@ class FrameRows:
             return self.interpolated(values, view)
         known = values.detach()[self._rows_by_time].cpu().double().numpy()
         return torch.from_numpy(Akima1DInterpolator(self._sorted_times, known)(view.time)).to(values)
-
-    def require(self, name: str, asking: str) -> int:
-        """The row of a training frame that settings name."""
-        if name in self.rows:
-            return self.rows[name]
-        shown = ", ".join(list(self.rows)[:6]) + (", ..." if len(self.rows) > 6 else "")
-        held_out = ", which is held out" if name in self._held_out else ""
-        raise InputError(
-            f"{asking} names frame '{name}'{held_out}",
-            f"a training frame, one of {shown}",
-            did_you_mean(name, self.rows),
-        )
 
 
 def _nearest_rows(scene: Scene) -> dict[str, int]:

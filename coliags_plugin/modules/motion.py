@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import ClassVar, Literal
+from typing import ClassVar
 
 import torch
 from jaxtyping import Float
@@ -24,32 +24,23 @@ from coliags_plugin.modules.frame_rows import FrameRows
 _DEPTH_POINTS = 4096
 
 
-class PoseCorrectionSettings(Settings):
-    """Options of the pose correction."""
-
-    fixed: tuple[str, ...] = ()  # training frames whose poses are right; none: corrections average to zero
-    # held-out frames: corrections interpolated in time between those of the training frames, or poses as given
-    untrained: Literal["interpolate", "given"] = "interpolate"
-
-
-class PoseCorrection(ViewModule[PoseCorrectionSettings]):
+class PoseCorrection(ViewModule[Settings]):
     """Learned rotation and translation of each training camera, in world axes.
 
     It turns about the point on its optical axis at the median depth of the scene's points in view (its pivot).
 
-    All poses and the field could move together without any image changing. The ``fixed`` frames hold them; without any,
-    the mean rotation and translation are subtracted.
+    All poses and the field could move together without any image changing: the mean rotation and translation are
+    subtracted.
 
     Held-out frames of the video are corrected as the training frames around them are, since errors of tracked poses
     change slowly; no pixel of theirs is used. Views beside the video take the correction of the nearest training
     camera. Free cameras stay.
     """
 
-    def __init__(self, settings: PoseCorrectionSettings, scene: Scene) -> None:
+    def __init__(self, settings: Settings, scene: Scene) -> None:
         super().__init__()
         self.settings = settings
         self.frames = FrameRows(scene)
-        self._fixed = {self.frames.require(name, "pose-correction") for name in settings.fixed}
         self._pivot_depths = [_median_depth(frame.camera, scene) for frame in scene.train]
         self.rotation = nn.Parameter(torch.zeros(len(self.frames), 3))
         self.translation = nn.Parameter(torch.zeros(len(self.frames), 3))
@@ -57,8 +48,6 @@ class PoseCorrection(ViewModule[PoseCorrectionSettings]):
     @property
     def untrained_views(self) -> str:
         """Treatment of views that are not training frames."""
-        if self.settings.untrained == "given":
-            return "views without training keep their poses as given"
         return (
             "views without training have their poses corrected by what is interpolated between the corrections of the "
             "training frames before and after them; views beside the video by that of the nearest training camera"
@@ -71,26 +60,15 @@ class PoseCorrection(ViewModule[PoseCorrectionSettings]):
     def adjust_camera(self, camera: Camera, view: View | None) -> Camera:
         """The camera with the correction of its frame, or of the training frames around it."""
         row = self.frames.row(view)
-        if row is not None:
-            return camera if row in self._fixed else self._moved(camera, row, row, 0.0)
-        if view is None or self.settings.untrained == "given":
+        if view is None:
             return camera
-        return self._moved(camera, *self.frames.neighbours(view))
-
-    def _moved(self, camera: Camera, before: int, after: int, share: float) -> Camera:
-        """The camera with the correction at a place in [0, 1] between two training frames."""
+        before, after, share = self.frames.neighbours(view) if row is None else (row, row, 0.0)
         rotation, translation = (torch.lerp(values[before], values[after], share) for values in self.corrections())
         depth = (1.0 - share) * self._pivot_depths[before] + share * self._pivot_depths[after]
         return camera.moved(rotation, translation, depth)
 
     def corrections(self) -> tuple[Float[Tensor, "F 3"], Float[Tensor, "F 3"]]:
-        """Rotation vectors (radians) and translations (scene units) of the training frames, in their order.
-
-        0 for the ``fixed`` frames; without any, they are zero on average.
-        """
-        if self._fixed:
-            free = constant(tuple((row not in self._fixed,) for row in range(len(self.frames))), self.rotation)
-            return self.rotation * free, self.translation * free
+        """Rotation vectors (radians) and translations (scene units) of the training frames, zero on average."""
         return self.rotation - self.rotation.mean(0), self.translation - self.translation.mean(0)
 
     @property
@@ -112,8 +90,6 @@ class ImageWarpSettings(Settings):
     """Options of the displacement of images."""
 
     cells: int = Field(default=8, ge=1)  # of the grid, along either side of the image
-    # held-out frames: displacements interpolated in time between those of the training frames, or none
-    untrained: Literal["interpolate", "none"] = "interpolate"
 
 
 class ImageWarp(ViewModule[ImageWarpSettings]):
@@ -138,8 +114,6 @@ class ImageWarp(ViewModule[ImageWarpSettings]):
     @property
     def untrained_views(self) -> str:
         """Displacement of views that are not training frames."""
-        if self.settings.untrained == "none":
-            return "views without training are not displaced"
         return (
             "views without training are displaced by what is interpolated between the training frames before and "
             "after them; views beside the video as the nearest training camera"
@@ -151,7 +125,7 @@ class ImageWarp(ViewModule[ImageWarpSettings]):
 
     def shade(self, output: RenderOutput, view: View | None) -> RenderOutput:
         """Displace the colours."""
-        if view is None or (self.frames.row(view) is None and self.settings.untrained == "none"):
+        if view is None:
             return output
         nodes = self.frames.interpolated(self.displacements(), view)
         height, width = output.rgb.shape[:2]

@@ -34,8 +34,8 @@ WAITS = Counter(
 )
 #: Methods and options whose steps are counted: every component that steps use is in one of them.
 STEPS = {
-    "coliags": ("losses.l1.outliers=3", "losses.l1.outliers_from=0"),
-    "coliags-in-vivo": ("modules.poses.fixed=['0001']",),
+    "coliags": (),
+    "coliags-in-vivo": (),
     "coliags-plus-sparse-depth": (),
     "2dgs": (),
     "3dgs-depth": (),

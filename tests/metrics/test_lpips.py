@@ -1,8 +1,10 @@
+from functools import partial
+
 import numpy as np
 import pytest
 import torch
 
-from coliags_plugin.core.errors import InputError, UnavailableError
+from coliags_plugin.core.errors import UnavailableError
 from coliags_plugin.metrics import lpips
 from coliags_plugin.metrics.lpips import TAPS, LPIPSNetwork, features
 from tests.metrics.made import images, lay_out, make, random_backbone, random_heads
@@ -13,11 +15,9 @@ NETS = ["vgg", "alex", "squeeze"]
 
 
 @pytest.fixture
-def squeeze(shared_data, nowhere):
-    def options(**more):
-        return make("lpips", net="squeeze", weights=str(shared_data / "lpips"), **more)
-
-    return options
+def squeeze(shared_data, nowhere, monkeypatch):
+    monkeypatch.setenv(lpips.WEIGHTS_VARIABLE, str(shared_data / "lpips"))
+    return partial(make, "lpips", net="squeeze")
 
 
 def test_the_example_images_score_as_the_lpips_package_scores_them(squeeze, examples):
@@ -104,27 +104,29 @@ def test_a_named_folder_comes_before_the_environment_s(heads, nowhere, monkeypat
     lay_out(nowhere / "second", "alex", heads)
     monkeypatch.setenv(lpips.WEIGHTS_VARIABLE, str(nowhere / "second"))
     assert {file.parents[heads.count("/")] for file in lpips.find_weights("alex")[1:]} == {nowhere / "second"}
-    backbone, linear = lpips.find_weights("alex", str(nowhere / "first"))
+    backbone, linear = lpips.find_weights("alex", nowhere / "first")
     assert backbone.parent == nowhere / "first"
     assert linear == nowhere / "first" / heads.format("alex")
 
 
-def test_missing_weights_say_what_and_how_to_get_it(nowhere, pair):
+def test_missing_weights_say_what_and_how_to_get_it(nowhere, pair, monkeypatch):
     with pytest.raises(UnavailableError) as caught:
         make("lpips", net="vgg")(pair)
     text = str(caught.value)
     for part in ("vgg16-397923af.pth", "v0.1/vgg.pth", "run `coliags weights lpips`"):
         assert part in text
     assert str(nowhere) not in text, "results are to be the same on every machine"
+    monkeypatch.setenv(lpips.WEIGHTS_VARIABLE, str(nowhere))
     torch.save(random_heads("vgg"), nowhere / "vgg.pth")
     with pytest.raises(UnavailableError, match="backbone") as caught:
-        make("lpips", net="vgg", weights=str(nowhere))(pair)
+        make("lpips", net="vgg")(pair)
     assert "linear heads" not in str(caught.value)
 
 
 @pytest.mark.parametrize("damage", ["truncated", "other net", "not tensors", "wrong heads", "negative heads"])
-def test_weights_that_do_not_fit_name_the_file(damage, nowhere, pair):
+def test_weights_that_do_not_fit_name_the_file(damage, nowhere, pair, monkeypatch):
     folder = nowhere / damage.replace(" ", "-")
+    monkeypatch.setenv(lpips.WEIGHTS_VARIABLE, str(folder))
     lay_out(folder, "squeeze")
     backbone, heads = folder / lpips.BACKBONE_FILES["squeeze"], folder / "v0.1" / "squeeze.pth"
     culprit = heads if "heads" in damage else backbone
@@ -139,20 +141,19 @@ def test_weights_that_do_not_fit_name_the_file(damage, nowhere, pair):
     else:
         torch.save({key: -value for key, value in random_heads("squeeze").items()}, heads)
     with pytest.raises(UnavailableError) as caught:
-        make("lpips", net="squeeze", weights=str(folder))(pair)
+        make("lpips", net="squeeze")(pair)
     assert str(culprit) in str(caught.value)
 
 
-def test_too_small_images_and_a_missing_folder(nowhere):
+def test_too_small_images():
     with pytest.raises(UnavailableError, match="40x31"):
         make("lpips")(images(torch.zeros(31, 40, 3), torch.ones(31, 40, 3)))
-    with pytest.raises(InputError, match="is not a folder"):
-        make("lpips", weights=str(nowhere / "nothing"))
 
 
-def test_the_network_is_read_once(nowhere, pair):
+def test_the_network_is_read_once(nowhere, pair, monkeypatch):
     lay_out(nowhere / "kept", "alex")
-    metric = make("lpips", net="alex", weights=str(nowhere / "kept"))
+    monkeypatch.setenv(lpips.WEIGHTS_VARIABLE, str(nowhere / "kept"))
+    metric = make("lpips", net="alex")
     with torch.inference_mode():
         first = metric(pair)
     (nowhere / "kept" / "v0.1" / "alex.pth").write_bytes(b"no longer read")

@@ -13,7 +13,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from coliags_plugin.config.method_config import load_method
-from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.render_output import RenderOutput
 from coliags_plugin.core.scenes import View
 from coliags_plugin.engine.run_folder import RunFolder
@@ -63,17 +62,6 @@ def test_gains_turn_within_a_held_out_stretch_where_slopes_say_so():
     assert turning.gain(middle).log().item() < lowest - 0.05
     bounded = make(0.002 * (times - 20.0) ** 2, scene, max_gain=math.exp(0.02 - lowest))
     assert bounded.gain(middle).log().item() == pytest.approx(lowest - 0.02)
-
-
-def test_options():
-    module = make(torch.linspace(0.0, 0.6, 7), untrained="mean", reference="0002")
-    assert module.gain(View("0002", 2.0, True)).item() == 1.0
-    assert module.gain(View("x", 6.0, False)).log().item() == pytest.approx(0.3 - 0.1)
-    with pytest.raises(InputError, match="gain names frame 'nobody'"):
-        make(reference="nobody")
-    (held_out, *_) = wall_scene().test_sets["test"]
-    with pytest.raises(InputError, match=f"gain names frame '{held_out.name}', which is held out"):
-        make(reference=held_out.name)
 
 
 @pytest.mark.parametrize("channels", [1, 3])
