@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import ClassVar, Literal, NamedTuple
 
 import torch
@@ -121,8 +120,7 @@ class GaussianField(Field[SettingsT]):
         """
 
 
-@dataclass(frozen=True)
-class RadianceSamples:
+class RadianceSamples(NamedTuple):
     """Density and colour of a radiance field at points along rays.
 
     Attributes:

@@ -192,39 +192,31 @@ class AnchorField(GaussianField[AnchorFieldSettings]):
     ) -> Gaussians:
         """Decode the visible anchors (docs/methods.md 3.5); a held light gives distances and angles to the lamp."""
         camera = camera.to(self.anchors.device, self.anchors.dtype)
-        decoded = self._on_device(camera, light) if fit_triton_kernels(self.anchors) else None
-        drawn, visible = decoded or self._of_visible(camera, light)
+        drawn, visible = self._children(camera, light)
         normals = None
         if self.normals is not None:
             normals = self.normals.index_select(0, drawn.source_index // self.settings.children)
         lit = self.appearance_head.apply_light(drawn.colors, drawn.means, normals, camera, light)
         return Gaussians(**{**drawn._asdict(), "colors": lit}, visible_sources=visible)
 
-    def _on_device(self, camera: Camera, light: HeldLight | None) -> tuple[DrawnChildren, Int[Tensor, "V"]] | None:
-        """Children by the kernels of triton, which find the visible anchors themselves; None without networks."""
-        networks = self._networks(_seen(self.anchors, self.features, self.normals, camera, light))
-        if networks is None:
-            return None
-        from coliags_plugin.fields.triton_kernels.children import visible_children
+    def _children(self, camera: Camera, light: HeldLight | None) -> tuple[DrawnChildren, Int[Tensor, "V"]]:
+        """Children of the visible anchors, and these: by kernels of a device or of the CPU, or by the definition."""
+        by_networks = all(head.decoding == "networks" for head in (self.geometry_head, self.appearance_head))
+        if by_networks and fit_triton_kernels(self.anchors):
+            from coliags_plugin.fields.triton_kernels.children import visible_children
 
-        return visible_children(self._rows, camera, self.features, *networks)
-
-    def _of_visible(self, camera: Camera, light: HeldLight | None) -> tuple[DrawnChildren, Int[Tensor, "V"]]:
-        """Children by the kernels of the CPU, or by the definition."""
+            head_inputs = _seen(self.anchors, self.features, self.normals, camera, light)
+            return visible_children(self._rows, camera, self.features, *self._networks(head_inputs))
         visible = self.visible_anchors(camera)
         anchors, features = (unique_rows(rows, visible) for rows in (self.anchors, self.features))
         normals = None if self.normals is None else self.normals.index_select(0, visible)
         head_inputs = _seen(anchors, features, normals, camera, light)
-        networks = self._networks(head_inputs) if fit_kernels(self.anchors) else None
-        if networks is not None:
-            return fused_children(self._rows, visible, features, *networks), visible
+        if by_networks and fit_kernels(self.anchors):
+            return fused_children(self._rows, visible, features, *self._networks(head_inputs)), visible
         opacities, covariances = self.geometry_head(head_inputs)
         return drawn_children(self._rows, visible, opacities, covariances, self.appearance_head(head_inputs)), visible
 
-    def _networks(self, head_inputs: SeenAnchors) -> tuple[HeadNetworks, HeadNetworks] | None:
-        """Networks of both heads for the kernels; None where one decodes by its ``forward`` alone."""
-        if any(head.decoding == "forward" for head in (self.geometry_head, self.appearance_head)):
-            return None
+    def _networks(self, head_inputs: SeenAnchors) -> tuple[HeadNetworks, HeadNetworks]:
         return self.geometry_head.networks(head_inputs), self.appearance_head.networks(head_inputs)
 
 

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import math
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
-from torch.autograd.function import once_differentiable
 from torch.nn import functional
 
 from coliags_plugin.config.components import AppearanceHeadNode
@@ -19,7 +17,7 @@ from coliags_plugin.core.lamps import HeldLight
 from coliags_plugin.core.photometry import fit_light
 from coliags_plugin.core.scenes import Scene
 from coliags_plugin.core.settings import Settings
-from coliags_plugin.core.tensors import fit_kernels, tables
+from coliags_plugin.core.tensors import fit_kernels
 
 #: Largest distance of the lamp from the optical centre along each camera axis, scene units (mm).
 MAX_OFFSET = 20.0
@@ -150,11 +148,11 @@ class AttenuatedAppearanceHead(AppearanceHead[AttenuatedAppearanceSettings]):
             return colors * self.law(*light.incidence(positions), incidences)
         lamp = camera.center + camera.camera_to_world[:3, :3] @ self.offset
         if fit_kernels(colors) and len(colors) >= _FEWEST:
+            from coliags_plugin.fields.numba_kernels.attenuation import attenuated
+
             exponents = functional.pad(self.exponents, (0, 3 - self.exponents.shape[1])).expand(3, 3)
             bounds = torch.stack([torch.tensor([_MIN_DISTANCE, _MIN_COSINE, _MIN_INCIDENCE]), self.reference.expand(3)])
-            arguments = (lamp, camera.optical_axis, exponents, positions, facing, bounds)
-            attenuated: Tensor = _Attenuate.apply(colors, *arguments)  # type: ignore[no-untyped-call]
-            return attenuated
+            return attenuated(colors, lamp, camera.optical_axis, exponents, positions, facing, bounds)
         rays = positions - lamp
         distances = rays.norm(dim=1).clamp_min(1e-9)
         incidences = None if facing is None else (facing * rays).sum(1).abs() / distances
@@ -169,42 +167,3 @@ class AttenuatedAppearanceHead(AppearanceHead[AttenuatedAppearanceSettings]):
             "lamp_offset": self.offset.detach().tolist(),
             "reference_distance": float(self.reference),
         }
-
-
-class _Attenuate(torch.autograd.Function):
-    """The kernels of ``numba_kernels/attenuation.py``."""
-
-    @staticmethod
-    def forward(
-        ctx: Any,
-        colors: Tensor,
-        lamp: Tensor,
-        axis: Tensor,
-        exponents: Tensor,
-        positions: Tensor,
-        normals: Tensor | None,
-        bounds: Tensor,
-    ) -> Tensor:
-        from coliags_plugin.core.numba_kernels.threads import workers
-        from coliags_plugin.fields.numba_kernels.attenuation import attenuate
-
-        facing = colors.new_empty(0) if normals is None else normals
-        view = torch.cat([lamp.detach(), axis.detach(), bounds.flatten()])
-        ctx.seen = tables(colors, positions, facing, view, exponents)
-        result = torch.empty(colors.shape)
-        with workers() as run:
-            run(attenuate, *ctx.seen, *tables(result))
-        return result
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, of_result: Tensor) -> tuple[Tensor | None, ...]:
-        from coliags_plugin.core.numba_kernels.threads import workers
-        from coliags_plugin.fields.numba_kernels.attenuation import SLABS, attenuate_backward
-
-        of_colors, sums = torch.empty(of_result.shape), torch.empty(SLABS, 16)
-        with workers() as run:
-            run(attenuate_backward, *ctx.seen, *tables(of_result, of_colors, sums))
-        total = sums.sum(0)
-        # Of logarithms to base 2, and of their powers, the exponents' derivatives have the factor ln 2.
-        return of_colors, total[9:12], total[12:15], math.log(2.0) * total[:9].view(3, 3), None, None, None

@@ -171,12 +171,12 @@ class _Fused(torch.autograd.Function):
             torch.cumsum(starts, 0, out=starts)
             count, ctx.starts = int(starts[-1]), starts[:-1].numpy()
             sources = torch.empty(count, dtype=torch.int64)
-            drawn = [new(count, *width) for width in ((3,), (4,), (3,), (), (3,), ())]
-            ctx.drawn = kernels.Drawn(*tables(sources, *drawn))
+            *drawn, inverse_lengths = (new(count, *width) for width in ((3,), (4,), (3,), (), (3,), ()))
+            ctx.drawn = kernels.Drawn(*tables(*drawn, sources, inverse_lengths))
             run(kernels.draw, ctx.widths, ctx.seen[0], *decoding, ctx.starts, ctx.drawn)
         ctx.save_for_backward(*inputs)
         ctx.mark_non_differentiable(sources)
-        return *drawn[:5], sources
+        return *drawn, sources
 
     @staticmethod
     @once_differentiable
@@ -194,18 +194,18 @@ class _Fused(torch.autograd.Function):
             for place, inputs_of_head in enumerate(ctx.seen[1:])
         ]
         sums = torch.zeros(kernels.SLABS, sum(network.numel() for network in networks))
-        transposed = [_filled(weight).t() for weight in networks if weight.dim() == 2]
+        transposed = [_filled(weight).t() if weight.dim() == 2 else weight for weight in networks]
         written = [*of_rows, of_features, *(zeros(0) if embedded is None else embedded for embedded in of_embedded)]
         with workers() as run:
             run(
                 kernels.decode_backward,
                 ctx.widths,
                 *ctx.seen,
-                kernels.Transposed(*tables(*transposed)),
+                kernels.Networks(*tables(*transposed)),
                 *ctx.hidden,
                 ctx.starts,
                 ctx.drawn,
-                kernels.Given(*tables(*of_outputs[:5])),
+                kernels.Drawn(*tables(*of_outputs[:5]), *ctx.drawn[5:]),
                 kernels.Found(*tables(*written)),
                 sums.numpy(),
             )

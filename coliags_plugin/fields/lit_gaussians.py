@@ -262,9 +262,8 @@ class LitGaussians(ExplicitField[LitGaussiansSettings]):
         if held_light is None and self.lamp != Lamp():
             arriving = arriving * self.lamp.spread(-lamps, camera)
         factors = self._factors(albedos, distances, normals, lamps, generator)
-        mirrored = fresnel(cosines, f0)
-        diffuse = (albedos * factors).clamp_min(0.0) * lambert(cosines, mirrored)[:, None]
-        light = diffuse + specular(cosines, mirrored, roughness)[:, None]
+        diffuse, specular = reflection(cosines, f0, roughness)
+        light = (albedos * factors).clamp_min(0.0) * diffuse[:, None] + specular[:, None]
         return light * arriving[:, None], factors
 
     def _factors(
@@ -333,35 +332,21 @@ class Cosines:
         return cls(cosines, cosines, cosines)
 
 
-def fresnel(cosines: Cosines, f0: Float[Tensor, "N"]) -> Float[Tensor, "N"]:
-    """Share of the light that the surface reflects, by Schlick's approximation; f0: that at normal incidence."""
-    if cosines.half_view is None:
-        return f0
-    return f0 + (1.0 - f0) * (1.0 - cosines.half_view).pow(5)
+def reflection(
+    cosines: Cosines, f0: Float[Tensor, "N"], roughness: Float[Tensor, "N"]
+) -> tuple[Float[Tensor, "N"], Float[Tensor, "N"]]:
+    """Diffuse BRDF of albedo 1 beneath the surface, and Cook-Torrance BRDF F D G / (4 <N, V> <N, L>), 1 / sr.
 
-
-def facet_density(normal_half: Float[Tensor, "N"], roughness: Float[Tensor, "N"]) -> Float[Tensor, "N"]:
-    """GGX: density of microfacets with normal H, 1 / sr, whose projected area integrates to 1.
-
-    The square of the roughness, which is above 0, is GGX's alpha.
+    Both are times <N, L>. F is Schlick's approximation of the share that the surface reflects, f0 at normal incidence;
+    what it leaves goes in. D is GGX's density of microfacets, with the square of the roughness, which is above 0, as
+    alpha. G = G1(<N, V>) G1(<N, L>), G1(t) = t / (t (1 - k) + k), k = (roughness + 1)^2 / 8: its numerators cancel the
+    denominator, so that the BRDF is finite at grazing angles. (Cook and Torrance 1982.)
     """
-    squared = roughness.pow(4)
-    return squared / (math.pi * (normal_half.square() * (squared - 1.0) + 1.0).square())
-
-
-def lambert(cosines: Cosines, reflected: Float[Tensor, "N"]) -> Float[Tensor, "N"]:
-    """Diffuse BRDF of albedo 1 beneath the surface, times <N, L>, 1 / sr: what :func:`fresnel` leaves goes in."""
-    return (1.0 - reflected) * cosines.normal_lamp / math.pi
-
-
-def specular(cosines: Cosines, reflected: Float[Tensor, "N"], roughness: Float[Tensor, "N"]) -> Float[Tensor, "N"]:
-    """Cook-Torrance BRDF F D G / (4 <N, V> <N, L>), times <N, L>, 1 / sr; F: :func:`fresnel`.
-
-    With G = G1(<N, V>) G1(<N, L>), G1(t) = t / (t (1 - k) + k), k = (roughness + 1)^2 / 8, whose numerators cancel the
-    denominator, so that it is finite at grazing angles.
-    """
+    reflected = f0 if cosines.half_view is None else f0 + (1.0 - f0) * (1.0 - cosines.half_view).pow(5)
+    diffuse = (1.0 - reflected) * cosines.normal_lamp / math.pi
     k = (roughness + 1.0).square() / 8.0
     masked = torch.lerp(k, torch.ones_like(k), cosines.normal_view)
     shadowed = masked if cosines.half_view is None else torch.lerp(k, torch.ones_like(k), cosines.normal_lamp)
-    density = facet_density(cosines.normal_half, roughness)
-    return cosines.normal_lamp * reflected * density / (4.0 * masked * shadowed)
+    alpha_squared = roughness.pow(4)
+    density = alpha_squared / (math.pi * (cosines.normal_half.square() * (alpha_squared - 1.0) + 1.0).square())
+    return diffuse, cosines.normal_lamp * reflected * density / (4.0 * masked * shadowed)

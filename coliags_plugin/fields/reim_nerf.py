@@ -151,10 +151,16 @@ class RadianceMLP(nn.Module):
                 hidden = functional.linear(hidden, weight, bias).relu_()
         return hidden
 
-    def raw_density(self, hidden: Float[Tensor, "P*S W"], rays: int) -> Float[Tensor, "P S"]:
-        """Density before ReLU, in normalised units, of what :meth:`hidden` gave for P rays."""
-        density = functional.linear(hidden.to(self.density.weight.dtype), self.density.weight, self.density.bias)
-        return density.view(rays, -1)
+    def densities(
+        self, hidden: Float[Tensor, "P*S W"], rays: int, generator: torch.Generator | None = None
+    ) -> Float[Tensor, "P S"]:
+        """Densities in normalised units, of what :meth:`hidden` gave for P rays, with noise in training."""
+        raw = functional.linear(hidden.to(self.density.weight.dtype), self.density.weight, self.density.bias)
+        raw = raw.view(rays, -1)
+        if generator is not None and self.settings.density_noise > 0:
+            noise = torch.randn(raw.shape, generator=generator, dtype=raw.dtype)
+            raw = raw + self.settings.density_noise * sent(noise, raw.device)
+        return raw.relu()
 
     def colors(
         self, hidden: Float[Tensor, "P*S W"], directions: Float[Tensor, "P 3"], light: Float[Tensor, "3"]
@@ -197,28 +203,16 @@ class _NetworkLevel(RadianceLevel):
         generator: torch.Generator | None = None,
     ) -> RadianceSamples:
         normalisation, network = self._parts()
-        hidden = self._hidden(positions, generator)
+        hidden = network.hidden(normalisation(positions), generator is None and not torch.is_grad_enabled())
         rgb = network.colors(hidden, directions, normalisation(camera.center))
-        return RadianceSamples(self._density(hidden, len(positions), generator), rgb)
+        return RadianceSamples(network.densities(hidden, len(positions), generator) / normalisation.unit, rgb)
 
     def query_density(
         self, positions: Float[Tensor, "P S 3"], directions: Float[Tensor, "P 3"], camera: Camera
     ) -> Float[Tensor, "P S"]:
-        return self._density(self._hidden(positions, None), len(positions), None)
-
-    def _hidden(self, positions: Tensor, generator: torch.Generator | None) -> Tensor:
         normalisation, network = self._parts()
-        return network.hidden(normalisation(positions), generator is None and not torch.is_grad_enabled())
-
-    def _density(self, hidden: Tensor, rays: int, generator: torch.Generator | None) -> Tensor:
-        """Per scene unit."""
-        normalisation, network = self._parts()
-        raw = network.raw_density(hidden, rays)
-        strength = network.settings.density_noise
-        if generator is not None and strength > 0:
-            noise = torch.randn(raw.shape, generator=generator, dtype=raw.dtype)
-            raw = raw + strength * sent(noise, raw.device)
-        return raw.relu() / normalisation.unit
+        hidden = network.hidden(normalisation(positions), not torch.is_grad_enabled())
+        return network.densities(hidden, len(positions)) / normalisation.unit
 
 
 class ReimNerf(_NetworkLevel, RadianceField[ReimNerfFieldSettings]):

@@ -169,8 +169,7 @@ class VolumeRenderer(Renderer[VolumeRendererSettings, RadianceField]):
         rgb: Tensor | None = None
         if generator is not None:
             where = (lines.positions(camera, places), lines.directions, camera)
-            samples = level.query(*where, generator)
-            density, rgb = samples.density, samples.rgb
+            density, rgb = level.query(*where, generator)
         elif torch.is_grad_enabled():
             density, rgb = _samples(level, camera, lines, places, slice(None), colors)
         else:
@@ -242,10 +241,7 @@ def _samples(
 ) -> tuple[Float[Tensor, "R S"], Float[Tensor, "R S 3"] | None]:
     """Density, and colours where asked for, at places along some of the rays."""
     where = (lines.positions(camera, places, rows), lines.directions[rows], camera)
-    if not colors:
-        return level.query_density(*where), None
-    samples = level.query(*where)
-    return samples.density, samples.rgb
+    return level.query(*where) if colors else (level.query_density(*where), None)
 
 
 def _samples_until_opaque(

@@ -17,17 +17,7 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.lamps import Lamp
 from coliags_plugin.core.scenes import PointCloud
 from coliags_plugin.fields import lit_gaussians
-from coliags_plugin.fields.lit_gaussians import (
-    _ROWS,
-    GAMMA,
-    PINK,
-    THICKNESS,
-    Cosines,
-    DiffuseNetwork,
-    fresnel,
-    lambert,
-    specular,
-)
+from coliags_plugin.fields.lit_gaussians import _ROWS, GAMMA, PINK, THICKNESS, Cosines, DiffuseNetwork, reflection
 from coliags_plugin.renderers.torch_renderer import render_gaussians
 from tests.fields.made import colored_wall, make_field
 from tests.scenes import camera_at, wall_scene
@@ -304,8 +294,7 @@ def direction(polar, azimuth):
 def brdf(view, lamp, roughness, f0):
     """Diffuse of albedo 1, and specular. 1 / sr"""
     cosines = Cosines.of(UP, view, lamp)
-    reflected = fresnel(cosines, double(f0))
-    terms = lambert(cosines, reflected), specular(cosines, reflected, double(roughness))
+    terms = reflection(cosines, double(f0), double(roughness))
     return [(term / cosines.normal_lamp).item() for term in terms]
 
 
@@ -340,9 +329,7 @@ def test_gradients_are_those_of_finite_differences_and_finite_at_grazing_angles(
     normal = torch.nn.functional.normalize(double(0.1, -0.2, 1.0)[None]).requires_grad_()
 
     def value(normal, view, lamp, roughness, f0):
-        cosines = Cosines.of(normal, view, lamp)
-        reflected = fresnel(cosines, f0)
-        return lambert(cosines, reflected) + specular(cosines, reflected, roughness)
+        return sum(reflection(Cosines.of(normal, view, lamp), f0, roughness))
 
     torch.autograd.gradcheck(value, (normal, view.requires_grad_(), lamp.requires_grad_(), roughness, f0))
     grazing = direction(math.pi / 2, 0.0)

@@ -67,7 +67,7 @@ def test_the_network_is_that_of_a_plain_forward_pass(light):
     per_point = torch.cat(seen, -1)[:, None].expand(-1, 7, -1)
     rgb = network.rgb(network.color(torch.cat([network.feature(hidden), per_point], -1)).relu()).sigmoid()
     found = network.hidden(positions)
-    torch.testing.assert_close(network.raw_density(found, 5), network.density(hidden)[..., 0])
+    torch.testing.assert_close(network.densities(found, 5), network.density(hidden)[..., 0].relu())
     torch.testing.assert_close(network.colors(found, directions, lamp), rgb)
     ours = torch.autograd.grad(network.colors(network.hidden(positions), directions, lamp).sum(), network.color.weight)
     theirs = torch.autograd.grad(rgb.sum(), network.color.weight)

@@ -6,14 +6,63 @@ lamp's position, then the optical axis, then the smallest values that the law is
 
 from __future__ import annotations
 
+import math
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
 from coliags_plugin.core.numba_kernels import lanes as vec
 from coliags_plugin.core.numba_kernels.compilation import inline, kernel, part
-from coliags_plugin.core.numba_kernels.threads import pieces
+from coliags_plugin.core.numba_kernels.threads import pieces, workers
+from coliags_plugin.core.tensors import tables
 
 #: Parts of the Gaussians whose sums are kept apart, so that they do not depend on the number of threads.
 SLABS = 32
 # As long as the sums of a slab: derivatives with respect to nine exponents, to the lamp's position and to the optical axis.
 _SUMS = (0,) * 15
+
+
+def attenuated(
+    colors: Float[Tensor, "N 3"],
+    lamp: Float[Tensor, "3"],
+    axis: Float[Tensor, "3"],
+    exponents: Float[Tensor, "3 3"],
+    positions: Float[Tensor, "N 3"],
+    normals: Float[Tensor, "N 3"] | None,
+    bounds: Float[Tensor, "2 3"],
+) -> Float[Tensor, "N 3"]:
+    """Colours times the law, differentiable once in the first four arguments; without normals incidence is 1.
+
+    ``bounds`` are the smallest values that the law is computed at, then three times the reference distance.
+    """
+    facing = colors.new_empty(0) if normals is None else normals
+    result: Tensor = _Attenuate.apply(colors, lamp, axis, exponents, positions, facing, bounds)  # type: ignore[no-untyped-call]
+    return result
+
+
+class _Attenuate(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, colors: Tensor, lamp: Tensor, axis: Tensor, exponents: Tensor, *others: Tensor) -> Tensor:
+        positions, facing, bounds = others
+        view = torch.cat([lamp.detach(), axis.detach(), bounds.flatten()])
+        ctx.seen = tables(colors, positions, facing, view, exponents)
+        result = torch.empty(colors.shape)
+        with workers() as run:
+            run(attenuate, *ctx.seen, *tables(result))
+        return result
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, of_result: Tensor) -> tuple[Tensor | None, ...]:
+        of_colors, sums = torch.empty(of_result.shape), torch.empty(SLABS, 16)
+        with workers() as run:
+            run(attenuate_backward, *ctx.seen, *tables(of_result, of_colors, sums))
+        total = sums.sum(0)
+        # Of logarithms to base 2, and of their powers, the exponents' derivatives have the factor ln 2.
+        return of_colors, total[9:12], total[12:15], math.log(2.0) * total[:9].view(3, 3), None, None, None
 
 
 @kernel

@@ -74,17 +74,6 @@ class Networks(NamedTuple):
     color_bias: Array
 
 
-class Transposed(NamedTuple):
-    """Transposed weights of :class:`Networks`, for the backward pass; inputs are filled up to whole vectors."""
-
-    of_features: Array
-    of_geometry: Array
-    of_appearance: Array
-    opacity: Array
-    covariance: Array
-    color: Array
-
-
 class Anchors(NamedTuple):
     """Positions and parameters of the anchors; ``sizes`` are the exponentials of the scalings."""
 
@@ -98,23 +87,13 @@ class Anchors(NamedTuple):
 class Drawn(NamedTuple):
     """Output Gaussians, and of their quaternions what the backward pass needs."""
 
+    means: Array
+    quats: Array
+    scales: Array
+    opacities: Array
+    colors: Array
     sources: Array  # int64, in M * K
-    means: Array
-    quats: Array
-    scales: Array
-    opacities: Array
-    colors: Array
     inverse_lengths: Array  # of the quaternions decoded
-
-
-class Given(NamedTuple):
-    """Gradients with respect to the output Gaussians."""
-
-    means: Array
-    quats: Array
-    scales: Array
-    opacities: Array
-    colors: Array
 
 
 class Found(NamedTuple):
@@ -231,9 +210,9 @@ def decode_backward(
 ):
     """Derivatives of :func:`decode_opacities` and :func:`draw`.
 
-    ``of_drawn`` are those with respect to what was drawn. ``transposed`` are the weights of networks with outputs as rows, and
-    inputs and units as columns. Written are ``of_anchors``, and in ``sums`` the derivatives with respect to the
-    networks, for each slab one behind the other.
+    ``of_drawn`` has those with respect to the output Gaussians in their places. ``transposed`` are networks whose weights have
+    outputs as rows, and inputs and units, filled up to whole vectors, as columns. Written are ``of_anchors``, and in ``sums`` the
+    derivatives with respect to the networks, for each slab one behind the other.
     """
     units, geometry_units = _units(widths)
     outputs = (_tile_of(widths.opacities), _tile_of(widths.covariances), _tile_of(widths.colors))
@@ -288,13 +267,15 @@ def _outputs_backward(n, first, rows, widths, anchors, opacities, drawn, of_draw
     of_colors[:] = 0.0
     for row in range(rows):
         m = anchors.visible[first + row]
-        _clear(first + row, widths, anchors, of_anchors)
+        # Nothing is found for the anchors since the visible one before, and behind the last visible one.
+        begin = anchors.visible[first + row - 1] + 1 if first + row else 0
+        end = m + 1 if first + row + 1 < len(anchors.visible) else len(anchors.sizes) // 6
+        of_anchors.scalings[6 * begin : 6 * end] = 0.0
+        of_anchors.offsets[3 * widths.children * begin : 3 * widths.children * end] = 0.0
         for k in range(widths.children):
             source = m * widths.children + k
             opacity = opacities[(first + row) * widths.opacities + k]
             if not opacity > 0.0:
-                for i in range(3):
-                    of_anchors.offsets[3 * source + i] = 0.0
                 continue
             of_opacities[row * widths.opacities + k] = of_drawn.opacities[n] * (ONE - opacity * opacity)
             logit, color = row * widths.covariances + 3 * k, row * widths.colors + 3 * k
@@ -317,15 +298,6 @@ def _outputs_backward(n, first, rows, widths, anchors, opacities, drawn, of_draw
                 across = of_drawn.quats[4 * n + i] - drawn.quats[4 * n + i] * along
                 of_covariances[quat + i] = across * drawn.inverse_lengths[n]
             n += 1
-
-
-@part
-def _clear(v, widths, anchors, of_anchors):
-    """Set to 0 what is found for the anchors since the visible one before, and behind the last visible one."""
-    begin = anchors.visible[v - 1] + 1 if v else 0
-    end = anchors.visible[v] + 1 if v + 1 < len(anchors.visible) else len(anchors.sizes) // 6
-    of_anchors.scalings[6 * begin : 6 * end] = 0.0
-    of_anchors.offsets[3 * widths.children * begin : 3 * widths.children * end] = 0.0
 
 
 @part
