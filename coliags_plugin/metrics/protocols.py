@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from types import MappingProxyType
 from typing import Any, ClassVar
 
 import torch
@@ -25,7 +24,10 @@ MetricTable = Mapping[str, tuple[str, Mapping[str, Any]]]
 # The splatting papers' variant: VGG fed [0, 1] unmapped (docs/methods.md 2.4).
 _LPIPS_OF_THE_PAPERS = {"net": "vgg", "input_range": "zero-one"}
 
-_DEPTH_METRICS = ("depth_mse", "depth_mse_inner", "depth_median_error", "depth_rmse", "depth_mae", "depth_abs_rel")
+_DEPTH_METRICS: MetricTable = {
+    name: (name, {})
+    for name in ("depth_mse", "depth_mse_inner", "depth_median_error", "depth_rmse", "depth_mae", "depth_abs_rel")
+}
 
 
 class PaperProtocol(Protocol):
@@ -43,23 +45,19 @@ class PaperProtocol(Protocol):
     #: The rendered depth that is scored.
     depth: ClassVar[str] = "depth_accumulated"
     wants: ClassVar[frozenset[str]] = frozenset({depth})
-    metrics: ClassVar[MetricTable] = MappingProxyType(
-        {
-            "psnr": ("psnr", {}),
-            "ssim": ("ssim", {}),
-            "lpips": ("lpips", _LPIPS_OF_THE_PAPERS),
-            # Not in the paper: its weights are small and easier to obtain than VGG's.
-            "lpips_squeeze": ("lpips", {"net": "squeeze", "input_range": "zero-one"}),
-        }
-        | {name: (name, {}) for name in _DEPTH_METRICS}
-    )
-    optional_metrics: ClassVar[MetricTable] = MappingProxyType(
-        {
-            "psnr_gain_fitted": ("psnr_gain_fitted", {}),
-            "sparse_depth_median": ("sparse_depth", {"quantile": 0.5}),
-            "sparse_depth_p90": ("sparse_depth", {"quantile": 0.9}),
-        }
-    )
+    metrics: ClassVar[MetricTable] = {
+        "psnr": ("psnr", {}),
+        "ssim": ("ssim", {}),
+        "lpips": ("lpips", _LPIPS_OF_THE_PAPERS),
+        # Not in the paper: its weights are small and easier to obtain than VGG's.
+        "lpips_squeeze": ("lpips", {"net": "squeeze", "input_range": "zero-one"}),
+        **_DEPTH_METRICS,
+    }
+    optional_metrics: ClassVar[MetricTable] = {
+        "psnr_gain_fitted": ("psnr_gain_fitted", {}),
+        "sparse_depth_median": ("sparse_depth", {"quantile": 0.5}),
+        "sparse_depth_p90": ("sparse_depth", {"quantile": 0.9}),
+    }
 
     def compare(self, output: RenderOutput, frame: Frame) -> Comparison:
         """Pair the rendered image, clamped to [0, 1], and the unchanged rendered depth with the frame."""
@@ -82,7 +80,7 @@ class ExpectedDepthProtocol(PaperProtocol):
     )
     depth: ClassVar[str] = "depth_expected"
     wants: ClassVar[frozenset[str]] = frozenset({depth})
-    metrics: ClassVar[MetricTable] = MappingProxyType({name: (name, {}) for name in ("psnr", "ssim", *_DEPTH_METRICS)})
+    metrics: ClassVar[MetricTable] = {"psnr": ("psnr", {}), "ssim": ("ssim", {}), **_DEPTH_METRICS}
 
 
 class MedianDepthProtocol(ExpectedDepthProtocol):
@@ -112,14 +110,12 @@ class AuthorsCodeProtocol(Protocol):
         "limit. SSIM 11x11 sigma 1.5; LPIPS VGG fed [0, 1]."
     )
     wants: ClassVar[frozenset[str]] = frozenset({"inverse_depth_accumulated"})
-    metrics: ClassVar[MetricTable] = MappingProxyType(
-        {
-            "psnr": ("psnr", {}),
-            "ssim": ("ssim", {}),
-            "lpips": ("lpips", _LPIPS_OF_THE_PAPERS),
-            "depth_mse": ("depth_mse", {}),
-        }
-    )
+    metrics: ClassVar[MetricTable] = {
+        "psnr": ("psnr", {}),
+        "ssim": ("ssim", {}),
+        "lpips": ("lpips", _LPIPS_OF_THE_PAPERS),
+        "depth_mse": ("depth_mse", {}),
+    }
 
     #: Depths of level 65535 in the files of rendered and true depth, mm.
     rendered_full_scale: ClassVar[float] = 150.0

@@ -85,6 +85,7 @@ def test_replaced_values_start_anew(stepped):
     optimizers.replace_values("sizes", torch.arange(5.0))
     assert field.part.sizes is parameter and parameter.tolist() == [0, 1, 2, 3, 4]
     assert not moments(optimizers, "sizes")["exp_avg"].any() and not moments(optimizers, "sizes")["exp_avg_sq"].any()
+    assert moments(optimizers, "points")["exp_avg"].any()
 
 
 def test_before_the_first_step_there_are_no_moments_to_cut():
