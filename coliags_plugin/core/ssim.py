@@ -87,26 +87,24 @@ class _Compare(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, a: Tensor, b: Tensor, gain: Tensor | None) -> Tensor:
         from coliags_plugin.core.numba_kernels.ssim import compare
-        from coliags_plugin.core.numba_kernels.threads import workers
+        from coliags_plugin.core.numba_kernels.threads import Crew
 
         result = torch.empty(a.shape)
         derivatives = torch.empty(3, *a.shape) if ctx.needs_input_grad[0] else torch.empty(0)
         ctx.sizes, ctx.images = (a.shape[1] * a.shape[2], a.shape[2], *tables(_window().float())), tables(a, b)
         factors = torch.empty(0) if gain is None else gain
         constants, *written, ctx.derivatives = tables(torch.tensor([C1, C2]), factors, result, derivatives)
-        with workers() as run:
-            run(compare, *ctx.sizes, constants, *ctx.images, *written, ctx.derivatives)
+        Crew().run(compare, *ctx.sizes, constants, *ctx.images, *written, ctx.derivatives)
         return result
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, given: Tensor) -> tuple[Tensor, None, None]:
         from coliags_plugin.core.numba_kernels.ssim import compare_backward
-        from coliags_plugin.core.numba_kernels.threads import workers
+        from coliags_plugin.core.numba_kernels.threads import Crew
 
         of_a = torch.empty(given.shape)
-        with workers() as run:
-            run(compare_backward, *ctx.sizes, *ctx.images, *tables(given), ctx.derivatives, *tables(of_a))
+        Crew().run(compare_backward, *ctx.sizes, *ctx.images, *tables(given), ctx.derivatives, *tables(of_a))
         return of_a, None, None
 
 

@@ -63,14 +63,13 @@ def drawn_children(
 
 def visible_anchors(rows: AnchorRows, camera: Camera) -> Int[Tensor, "V"]:
     """Indices of anchors of which any child may overlap the image, by a kernel for float32 on the CPU."""
-    from coliags_plugin.core.numba_kernels.threads import workers
+    from coliags_plugin.core.numba_kernels.threads import Crew
     from coliags_plugin.fields.numba_kernels.decoding import find_visible
 
     camera = camera.to(torch.device("cpu"), torch.float32)
     visible = torch.empty(len(rows.positions), dtype=torch.bool)
     arguments = tables(rows.positions, rows.offsets, rows.scalings.exp(), camera.center, frustum_planes(camera))
-    with workers() as run:
-        run(find_visible, rows.offsets.shape[1], DRAWN_SIGMAS, *arguments, camera.near_plane, visible.numpy())
+    Crew().run(find_visible, rows.offsets.shape[1], DRAWN_SIGMAS, *arguments, camera.near_plane, visible.numpy())
     return visible.nonzero().squeeze(1)
 
 
@@ -149,7 +148,7 @@ class _Fused(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, widths: tuple[int, ...], waves: list[tuple[int, int]], *inputs: Tensor) -> tuple[Tensor, ...]:
-        from coliags_plugin.core.numba_kernels.threads import workers
+        from coliags_plugin.core.numba_kernels.threads import Crew
         from coliags_plugin.fields.numba_kernels import decoding as kernels
 
         visible, positions, offsets, scalings, features, geometry, appearance, *networks = inputs
@@ -166,14 +165,13 @@ class _Fused(torch.autograd.Function):
         )
         decoding = (kernels.Networks(*tables(*networks)), *ctx.hidden)
         starts = torch.zeros(-(-len(visible) // kernels.TILE) + 1, dtype=torch.int64)
-        with workers() as run:
-            run(kernels.decode_opacities, ctx.widths, *ctx.seen, *decoding, starts[1:].numpy())
-            torch.cumsum(starts, 0, out=starts)
-            count, ctx.starts = int(starts[-1]), starts[:-1].numpy()
-            sources = torch.empty(count, dtype=torch.int64)
-            *drawn, inverse_lengths = (new(count, *width) for width in ((3,), (4,), (3,), (), (3,), ()))
-            ctx.drawn = kernels.Drawn(*tables(*drawn, sources, inverse_lengths))
-            run(kernels.draw, ctx.widths, ctx.seen[0], *decoding, ctx.starts, ctx.drawn)
+        Crew().run(kernels.decode_opacities, ctx.widths, *ctx.seen, *decoding, starts[1:].numpy())
+        torch.cumsum(starts, 0, out=starts)
+        count, ctx.starts = int(starts[-1]), starts[:-1].numpy()
+        sources = torch.empty(count, dtype=torch.int64)
+        *drawn, inverse_lengths = (new(count, *width) for width in ((3,), (4,), (3,), (), (3,), ()))
+        ctx.drawn = kernels.Drawn(*tables(*drawn, sources, inverse_lengths))
+        Crew().run(kernels.draw, ctx.widths, ctx.seen[0], *decoding, ctx.starts, ctx.drawn)
         ctx.save_for_backward(*inputs)
         ctx.mark_non_differentiable(sources)
         return *drawn, sources
@@ -181,7 +179,7 @@ class _Fused(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *of_outputs: Tensor) -> tuple[Tensor | None, ...]:
-        from coliags_plugin.core.numba_kernels.threads import workers
+        from coliags_plugin.core.numba_kernels.threads import Crew
         from coliags_plugin.fields.numba_kernels import decoding as kernels
 
         visible, _, offsets, scalings, features, geometry, appearance, *networks = ctx.saved_tensors
@@ -196,19 +194,18 @@ class _Fused(torch.autograd.Function):
         sums = torch.zeros(kernels.SLABS, sum(network.numel() for network in networks))
         transposed = [_filled(weight).t() if weight.dim() == 2 else weight for weight in networks]
         written = [*of_rows, of_features, *(zeros(0) if embedded is None else embedded for embedded in of_embedded)]
-        with workers() as run:
-            run(
-                kernels.decode_backward,
-                ctx.widths,
-                *ctx.seen,
-                kernels.Networks(*tables(*transposed)),
-                *ctx.hidden,
-                ctx.starts,
-                ctx.drawn,
-                kernels.Drawn(*tables(*of_outputs[:5]), *ctx.drawn[5:]),
-                kernels.Found(*tables(*written)),
-                sums.numpy(),
-            )
+        Crew().run(
+            kernels.decode_backward,
+            ctx.widths,
+            *ctx.seen,
+            kernels.Networks(*tables(*transposed)),
+            *ctx.hidden,
+            ctx.starts,
+            ctx.drawn,
+            kernels.Drawn(*tables(*of_outputs[:5]), *ctx.drawn[5:]),
+            kernels.Found(*tables(*written)),
+            sums.numpy(),
+        )
         of_inputs = [
             None if embedded is None else _embedding_backward(embedded, values, *wave)
             for embedded, values, wave in zip(of_embedded, (geometry, appearance), ctx.waves, strict=True)

@@ -68,7 +68,7 @@ def render_gaussians(
         InputError: An output is unknown or not of these Gaussians; a tensor is of the wrong shape, dtype or device; a
             Gaussian is not finite, has a quaternion of length 0 or a negative scale; the camera cannot be used.
     """
-    from coliags_plugin.renderers.numba_kernels import autograd, pipeline
+    from coliags_plugin.renderers.numba_kernels import pipeline
 
     settings = settings or CutSettings()
     check_gaussian_outputs(wants, gaussians)
@@ -82,7 +82,7 @@ def render_gaussians(
     stages = pipeline.Pipeline(primitive, view, camera.width, camera.height, wanted)
     channels = [name for name in wants if name in gaussians.features]
     try:
-        means2d, radii, images, features = autograd.render(
+        means2d, radii, images, features = pipeline.render(
             [getattr(gaussians, name) for name in _SHAPES],
             [gaussians.features[name] for name in channels],
             pose,

@@ -19,7 +19,6 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.gaussians import rotation_matrices
 from coliags_plugin.core.render_output import OUTPUTS
 from coliags_plugin.renderers import cpu_renderer, torch_renderer, triton_renderer
-from coliags_plugin.renderers.numba_kernels import pipeline
 from coliags_plugin.renderers.torch_renderer import TorchRendererSettings
 from tests.renderers import test_surfels as surfels
 from tests.renderers import test_torch_renderer as solids
@@ -259,10 +258,7 @@ def test_features_that_are_none(renderer):
 
 
 @of_each
-@pytest.mark.parametrize("sort", ["by one thread", "by all"])
-def test_repeats_to_the_bit_with_any_number_of_threads(primitive, sort, monkeypatch):
-    if sort == "by all":
-        monkeypatch.setattr(pipeline, "_WORTH_SHARING_SORT", 0)
+def test_repeats_to_the_bit_with_any_number_of_threads(primitive):
     gaussians, camera = scene(primitive, "thousands")
     wants = outputs_of(gaussians)
     if primitive == "surfels":

@@ -16,7 +16,7 @@ from torch.autograd.function import once_differentiable
 from coliags_plugin.core.numba_kernels import lanes as vec
 from coliags_plugin.core.numba_kernels.compilation import inline, kernel, part
 from coliags_plugin.core.numba_kernels.lanes import WIDTH
-from coliags_plugin.core.numba_kernels.threads import pieces, workers
+from coliags_plugin.core.numba_kernels.threads import Crew, pieces
 from coliags_plugin.core.tensors import tables
 from coliags_plugin.fields.spherical_harmonics import FACTORS, Y0
 
@@ -55,8 +55,7 @@ class _Colors(torch.autograd.Function):
         ctx.save_for_backward(sh0, shN, sight, rows)
         ctx.terms = (degree + 1) ** 2
         result = torch.empty_like(sight, memory_format=torch.contiguous_format)
-        with workers() as run:
-            run(_forward, ctx.terms, *tables(sh0, shN, rows, sight, result))
+        Crew().run(_forward, ctx.terms, *tables(sh0, shN, rows, sight, result))
         return result
 
     @staticmethod
@@ -65,8 +64,7 @@ class _Colors(torch.autograd.Function):
         saved = ctx.saved_tensors
         results = [torch.empty_like(tensor, memory_format=torch.contiguous_format) for tensor in saved[:3]]
         sh0, shN, sight, rows = tables(*saved)
-        with workers() as run:
-            run(_backward, ctx.terms, sh0, shN, rows, sight, *tables(of_color, *results))
+        Crew().run(_backward, ctx.terms, sh0, shN, rows, sight, *tables(of_color, *results))
         return *results, None, None
 
 

@@ -1,4 +1,4 @@
-"""Sorting of the drawn Gaussians by depth, and their binning into tiles and blocks, front to back.
+"""Binning of the drawn Gaussians, sorted by depth, into tiles and blocks, front to back.
 
 Tiles and blocks only save work: what is listed here is a superset of the pairs of pixel and Gaussian with
 alpha >= alpha_min, and the sweeps test each of those again. The list of Gaussians is cut into stretches that
@@ -12,20 +12,13 @@ from coliags_plugin.core.numba_kernels.compilation import inline, kernel, part
 from coliags_plugin.core.numba_kernels.threads import pieces, take
 from coliags_plugin.renderers.numba_kernels import layout
 from coliags_plugin.renderers.numba_kernels.geometry import may_show, squared_distance_to_box
-from coliags_plugin.renderers.numba_kernels.tiles import order_tiles
 
 #: Prefetch distance, Gaussians.
 _AHEAD = 8
-#: Largest number of bits of a digit.
-DIGIT_BITS = 11
-#: Number of counters of one stretch.
-DIGITS = 1 << DIGIT_BITS
-#: Mask of the Gaussian's index in a key.
-NUMBER = (1 << 32) - 1
 
 
 @kernel
-def find_pairs(counters, projections, view, grid, circle, keys, pairs, entry_counts):
+def find_pairs(counters, projections, view, grid, circle, nearest_first, pairs, entry_counts):
     """Pair the Gaussians with the tiles they touch.
 
     ``circle`` is an empty tuple for 3D Gaussians, and one with an element for surfels, which also reach a circle; records are
@@ -34,27 +27,37 @@ def find_pairs(counters, projections, view, grid, circle, keys, pairs, entry_cou
     """
     stretches = len(pairs.begins)
     for stretch in pieces(counters, 0, stretches):
-        first, last = len(keys) * stretch // stretches, len(keys) * (stretch + 1) // stretches
-        begin = take(counters, 1, _tiles_within_bounds(first, last, keys, projections.bounds))
+        first, last = len(nearest_first) * stretch // stretches, len(nearest_first) * (stretch + 1) // stretches
+        begin = take(counters, 1, _tiles_within_bounds(first, last, nearest_first, projections.bounds))
         pairs.begins[stretch] = begin
         pairs.ends[stretch] = _find_stretch(
-            first, last, begin, stretch * grid.tiles, projections, view, grid, circle, keys, pairs, entry_counts
+            first,
+            last,
+            begin,
+            stretch * grid.tiles,
+            projections,
+            view,
+            grid,
+            circle,
+            nearest_first,
+            pairs,
+            entry_counts,
         )
 
 
 @part
-def _tiles_within_bounds(first, last, keys, bounds):
+def _tiles_within_bounds(first, last, nearest_first, bounds):
     """Upper bound of the number of pairs of the Gaussians with indices ``first`` to ``last`` in the sorted list."""
     total = 0
     for place in range(first, last):
-        at = 4 * (keys[place] & NUMBER)
+        at = 4 * (nearest_first[place])
         across = int(vec.number(bounds, at + 1)) - int(vec.number(bounds, at)) + 1
         total += across * (int(vec.number(bounds, at + 3)) - int(vec.number(bounds, at + 2)) + 1)
     return total
 
 
 @part
-def _find_stretch(first, last, pair, counted, projections, view, grid, circle, keys, pairs, entry_counts):
+def _find_stretch(first, last, pair, counted, projections, view, grid, circle, nearest_first, pairs, entry_counts):
     """Pair the Gaussians with indices ``first`` to ``last`` in the sorted list.
 
     Writes the pairs from ``pair`` on and counts those of each tile from ``counted`` on; returns the index after the last.
@@ -65,10 +68,10 @@ def _find_stretch(first, last, pair, counted, projections, view, grid, circle, k
     block_left = vec.fma(vec.lane_columns(), layout.BLOCK, 0.5)
     block_top = vec.fma(vec.lane_rows(), layout.BLOCK, 0.5)
     for place in range(first, last):
-        ahead = keys[min(place + _AHEAD, last - 1)] & NUMBER
+        ahead = nearest_first[min(place + _AHEAD, last - 1)]
         vec.prefetch(records, layout.ROW * ahead)
         vec.prefetch(bounds, 4 * ahead)
-        index = keys[place] & NUMBER
+        index = nearest_first[place]
         row, bound = layout.ROW * index, 4 * index
         u_xx, u_yx = vec.broadcast(records, row + layout.U_XX), vec.broadcast(records, row + layout.U_YX)
         u_yy = vec.broadcast(records, row + layout.U_YY)
@@ -137,27 +140,11 @@ def _circle(records, row):
 
 
 @kernel
-def place_entries(grid, pairs, bins):
-    """Turn the counts of :func:`find_pairs` into offsets; write ``stretch_entries``, ``starts`` and ``order``."""
-    stretches = len(pairs.begins)
-    total = 0
-    for stretch in range(stretches):
-        bins.stretch_entries[stretch] = total
-        total += pairs.ends[stretch] - pairs.begins[stretch]
-    bins.stretch_entries[stretches] = total
-    total = 0
-    for tile in range(grid.tiles):
-        bins.starts[tile] = total
-        for stretch in range(stretches):
-            at = stretch * grid.tiles + tile
-            total, pairs.tile_counts[at] = total + pairs.tile_counts[at], total
-    bins.starts[grid.tiles] = total
-    order_tiles(bins.starts, bins.order)
-
-
-@kernel
 def sort_pairs(counters, grid, pairs, bins):
-    """Sort the pairs by tile into ``bins.cells``; the offsets of :func:`place_entries` are incremented."""
+    """Sort the pairs by tile into ``bins.cells``.
+
+    ``pairs.tile_counts`` are the offsets of the first entry of each stretch and tile, which are incremented.
+    """
     cells, places = bins.cells, pairs.tile_counts
     for stretch in pieces(counters, 2, len(pairs.begins)):
         entry, first = bins.stretch_entries[stretch], stretch * grid.tiles
@@ -169,62 +156,3 @@ def sort_pairs(counters, grid, pairs, bins):
             cells[cell + 1] = pairs.blocks[pair]
             cells[cell + 2] = entry
             entry += 1
-
-
-# --- stable radix sort by depth, least significant digit first --------------------------------------------------------
-
-
-@kernel
-def collect(counters, depth_bits, drawn, places, keys, lowest, highest):
-    """Write the sort keys: depth bits in the upper half, index of the Gaussian in the lower.
-
-    The bits of positive floats order as the numbers do. ``places`` is the offset of the first key of each parcel; ``lowest``
-    and ``highest`` are written: the range of depth bits in each parcel.
-    """
-    per_parcel = layout.PARCEL // layout.GROUP
-    for parcel in pieces(counters, 0, len(places)):
-        low, high = NUMBER, 0
-        place = places[parcel]
-        for group in range(parcel * per_parcel, min((parcel + 1) * per_parcel, len(drawn))):
-            flags = drawn[group]
-            while flags:
-                index = layout.GROUP * group + vec.lowest_bit(flags)
-                flags &= flags - 1
-                depth = int(depth_bits[index])
-                keys[place] = depth << 32 | index
-                place += 1
-                low, high = min(low, depth), max(high, depth)
-        lowest[parcel], highest[parcel] = low, high
-
-
-@kernel
-def count_digits(counters, stretches, keys, lowest, shift, mask, digits):
-    """Histogram of the digits, ``mask`` after ``shift`` of depth bits less ``lowest``. [DIGITS for each stretch]"""
-    for stretch in pieces(counters, 0, stretches):
-        start = stretch * DIGITS
-        for digit in range(mask + 1):
-            digits[start + digit] = 0
-        for place in range(len(keys) * stretch // stretches, len(keys) * (stretch + 1) // stretches):
-            digits[start + (((keys[place] >> 32) - lowest) >> shift & mask)] += 1
-
-
-@kernel
-def place_digits(stretches, mask, digits):
-    """Turn the histograms into offsets of the first key of each digit and stretch."""
-    total = 0
-    for digit in range(mask + 1):
-        for stretch in range(stretches):
-            at = stretch * DIGITS + digit
-            total, digits[at] = total + digits[at], total
-
-
-@kernel
-def move_by_digit(counters, stretches, keys, lowest, shift, mask, digits, moved):
-    """Scatter the keys into ``moved`` by digit; the offsets in ``digits`` are incremented."""
-    for stretch in pieces(counters, 1, stretches):
-        start = stretch * DIGITS
-        for place in range(len(keys) * stretch // stretches, len(keys) * (stretch + 1) // stretches):
-            key = keys[place]
-            at = start + (((key >> 32) - lowest) >> shift & mask)
-            moved[digits[at]] = key
-            digits[at] += 1

@@ -187,9 +187,9 @@ class Pairs(NamedTuple):
 class Bins(NamedTuple):
     """Tile intersections, (Gaussian, tile) pairs sorted by tile, then by depth; one pair is an "entry"."""
 
-    keys: Array  # Gaussians drawn, nearest first; the index of the Gaussian is in the lower 32 bits
+    nearest_first: Array  # indices of the Gaussians drawn
     entry_counts: Array  # entries of each of them
-    stretch_entries: Array  # number of the first entry of each stretch of keys, and at the end how many there are
+    stretch_entries: Array  # number of the first entry of each stretch of these, and at the end how many there are
     cells: Array  # see CELL; 3 for each entry
     starts: Array  # first entry of each tile, and at the end how many there are
     order: Array  # tiles, long lists first

@@ -1,14 +1,27 @@
-"""Execution of the kernels in order, and their memory."""
+"""Execution of the kernels in order, their memory, and the autograd functions that do both: Gaussians -> images.
+
+Between projection and compositing goes, beside the projected centres, a tensor of links, whose content does not matter:
+the gradients it receives are the sums that the layouts describe, from which the derivatives of the Gaussians follow more
+directly and with less cancellation than from those of the projections.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+import math
+import weakref
+from collections import deque
+from collections.abc import Callable, Collection, Iterable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+from torch.autograd.function import FunctionCtx, once_differentiable
 
 from coliags_plugin.core.numba_kernels.compilation import Array
-from coliags_plugin.core.numba_kernels.threads import Runner, workers
+from coliags_plugin.core.numba_kernels.threads import Crew
+from coliags_plugin.core.tensors import tables
 from coliags_plugin.renderers.numba_kernels import (
     binning,
     layout,
@@ -18,17 +31,15 @@ from coliags_plugin.renderers.numba_kernels import (
     sweep_forward,
     tiles,
 )
-from coliags_plugin.renderers.numba_kernels.buffers import ArenaPool, Results
 
 #: Pieces of work per thread where their costs differ.
 _PIECES = 8
-#: Fewer Gaussians are sorted by one thread: bringing others in several times over costs more than they gain.
-_WORTH_SHARING_SORT = 1 << 17
 #: Largest number of pairs of the lists.
 _MOST_PAIRS = 2**31 - 1
-
-_arenas = ArenaPool()
-_results = Results()
+#: Bytes that arrays begin at a multiple of, a line of the cache; and of a page of memory.
+_ALIGNMENT, _PAGE = 64, 4096
+#: Memory is taken this much larger than asked for, and of so many arrays it is kept for later.
+_GROWTH, _KEPT = 1.25, 64
 
 
 class UnusableGaussianError(Exception):
@@ -37,6 +48,41 @@ class UnusableGaussianError(Exception):
 
 class TooManyPairsError(Exception):
     """The Gaussians cover more tiles than the lists can hold; the argument is the number of tiles."""
+
+
+class Pool:
+    """Arrays whose memory is used again when they are garbage collected: new pages cost more than the kernels.
+
+    Safe to use from several threads, and without a lock: memory comes back whenever Python collects garbage, which may be
+    in the middle of :meth:`take`.
+    """
+
+    def __init__(self) -> None:
+        self._free: deque[npt.NDArray[np.uint8]] = deque(maxlen=_KEPT)
+
+    def take(self, *shape: int, dtype: npt.DTypeLike = np.float32) -> Array:
+        """Take an array with undefined content."""
+        size = np.dtype(dtype).itemsize * math.prod(shape)
+        # Views of views refer to the first array that does not refer to another: this one, because of the memoryview.
+        buffer = self._buffer(size)
+        array = np.frombuffer(memoryview(buffer)[:size], dtype)
+        weakref.finalize(array, self._free.append, buffer).atexit = False
+        return array.reshape(shape)
+
+    def _buffer(self, size: int) -> npt.NDArray[np.uint8]:
+        for _ in range(len(self._free)):
+            try:
+                buffer = self._free.popleft()
+            except IndexError:
+                break
+            if size <= len(buffer) <= 2 * size + _PAGE:
+                return buffer
+            self._free.append(buffer)
+        buffer = np.empty(int(size * _GROWTH) + 2 * _ALIGNMENT, np.uint8)
+        return buffer[-buffer.ctypes.data % _ALIGNMENT :]
+
+
+_pool = Pool()
 
 
 class Primitive(NamedTuple):
@@ -48,10 +94,8 @@ class Primitive(NamedTuple):
         scales: Scales of a Gaussian.
         circle: Whether Gaussians also reach a circle, the low-pass filter's: outlines differ from records then.
         constant_images: Images without derivatives.
-        first_channel: First of the channels' columns of records.
+        first_channel: First of the channels' columns of records, the colour's.
         first_sum: First of the channels' columns of sums.
-        feature_channels: How many feature channels one sweep composites.
-        feature_images: The images that hold them.
     """
 
     project: Callable[..., None]
@@ -65,8 +109,6 @@ class Primitive(NamedTuple):
     constant_images: tuple[str, ...]
     first_channel: int
     first_sum: int
-    feature_channels: int
-    feature_images: tuple[str, ...]
 
 
 def _gaussian_outputs(images: Collection[str]) -> layout.Outputs:
@@ -93,8 +135,6 @@ GAUSSIANS = Primitive(
     constant_images=("median",),
     first_channel=layout.CHANNELS,
     first_sum=layout.SUM_CHANNELS,
-    feature_channels=layout.MAX_CHANNELS,
-    feature_images=("rgb", "depth", "inverse_depth", "normals"),
 )
 SURFELS = Primitive(
     projection.project_surfels,
@@ -108,21 +148,20 @@ SURFELS = Primitive(
     constant_images=(),
     first_channel=layout.SURFEL_CHANNELS,
     first_sum=layout.SURFEL_SUM_CHANNELS,
-    feature_channels=3,  # as colours alone, whose kernels serve
-    feature_images=("rgb",),
 )
 
 
 class Layer(NamedTuple):
-    """Inputs of one forward and backward sweep: projected Gaussians, the view, and what is composited."""
+    """What a forward and a backward sweep composite: projected Gaussians, the view, the numbers, and images by name."""
 
     projections: layout.Projections
     view: Array
     outputs: layout.Outputs
+    images: Collection[str]
 
 
 class Pipeline:
-    """Rendering of N Gaussians, or surfels, from one camera, stage by stage, with the intermediate tables.
+    """Rendering of N Gaussians, or surfels, from one camera, stage by stage, with the tables between the stages.
 
     ``view`` is that of ``layout``; ``wanted`` are the images to draw, fields of ``layout.Images``; depth is among them if
     expected is.
@@ -130,152 +169,47 @@ class Pipeline:
 
     def __init__(self, primitive: Primitive, view: Array, width: int, height: int, wanted: Collection[str]) -> None:
         columns = -(-width // layout.TILE)
-        self._primitive = primitive
+        self.primitive = primitive
         self._view = view
         self._grid = layout.Grid(width, height, columns, columns * -(-height // layout.TILE))
         self._wanted = wanted
         self._outputs = primitive.outputs(wanted)
-        self._arena = _arenas.lend(self)
+        self._crew = Crew()
         self._count = 0
-        self._tail: layout.Parameters
         self._projections: layout.Projections
         self._bins: layout.Bins
-        self._composited: Array
-        self._feature_composited: Array
 
-    @property
-    def constant_images(self) -> tuple[str, ...]:
-        """Images without derivatives."""
-        return self._primitive.constant_images
-
-    @property
-    def _main_layer(self) -> Layer:
-        """Colours and all that is wanted besides."""
-        return Layer(self._projections, self._view, self._outputs)
-
-    def _sums(self, outputs: layout.Outputs) -> int:
-        """Sums of each Gaussian and entry."""
-        return self._primitive.first_sum + len(outputs.channels) + len(outputs.normals)
-
-    def _sums_size(self, outputs: layout.Outputs, rows: int) -> int:
-        """Length of the table of sums of ``rows`` Gaussians or entries: 16 floats each, 17 if there are too many sums."""
-        return (layout.ROW + (self._sums(outputs) > layout.ROW)) * rows
-
-    def _sweep(self, run: Runner, kernel: Callable[..., None], layer: Layer, *tables: Any) -> None:
-        """Run a sweep, which takes or writes the tables."""
-        numbers = self._arena.take("numbers", run.workers * tiles.NUMBERS)
-        scratch = layout.Scratch(numbers, self._arena.take("integers", run.workers * tiles.INTEGERS, np.int32))
-        run(kernel, layer.projections, self._bins, layer.view, self._grid, layer.outputs, scratch, *tables)
-
-    def _sweep_backward(
-        self, run: Runner, layer: Layer, composited: Array, of_images: layout.Images, sums: Array, of_means2d: Array
-    ) -> None:
-        """Find the sums of Gaussians, and the derivative with respect to the projected centres."""
-        entry_sums = self._arena.take("entry_sums", self._sums_size(layer.outputs, int(self._bins.starts[-1])))
-        seventeen = self._sums(layer.outputs) > layout.ROW
-        tables = (composited, _flat_images(of_images), seventeen, entry_sums)
-        self._sweep(run, self._primitive.sweep_backward, layer, *tables)
-        gathered = (entry_sums, sums, of_means2d.reshape(-1))
-        run(self._primitive.gather, layer.projections, self._bins, layer.view, seventeen, *gathered)
-
-    # --- stages -------------------------------------------------------------------------------------------------------
+    # --- projection ---------------------------------------------------------------------------------------------------
 
     def project(self, gaussians: layout.Parameters) -> tuple[Array, Array, Array]:
-        """Project Gaussians; UnusableGaussianError where one is not finite, has no direction or a negative scale.
+        """Project Gaussians, and list those of each tile.
 
-        Returns projected centres in pixels [N, 2], radii in pixels [N], and a table without content of the shape of the Gaussians'
-        sums, which stands for all else in the graph of derivatives.
+        Returns projected centres in pixels [N, 2], radii in pixels [N], and a table without content of the shape of the
+        Gaussians' sums, which stands for all else in the graph of derivatives.
+
+        Raises:
+            UnusableGaussianError: One is not finite, has no direction or a negative scale.
+            TooManyPairsError: They cover too many tiles.
         """
         self._count = count = len(gaussians.opacities)
-        groups, filled, take = -(-count // layout.GROUP), self._filled, self._arena.take
-        self._tail = _tail(gaussians, count, self._primitive.scales)
-        records = take("records", layout.ROW * filled)
+        filled, circle, take = self._filled, self.primitive.circle, _pool.take
+        records = take(layout.ROW * filled)
         self._projections = layout.Projections(
             records=records,
-            outlines=take("outlines", len(records)) if self._primitive.circle else records,
-            remainders=take("remainders", 2 * filled * self._primitive.circle),
-            depths=take("depths", filled),
-            bounds=take("bounds", 4 * filled),
-            drawn=take("drawn", groups, np.int64),
-            parcels=take("parcels", 2 * -(-count // layout.PARCEL), np.int64),
+            outlines=take(len(records)) if circle else records,
+            remainders=take(2 * filled * circle),
+            depths=take(filled),
+            bounds=take(4 * filled),
+            drawn=take(filled // layout.GROUP, dtype=np.int64),
+            parcels=take(2 * -(-count // layout.PARCEL), dtype=np.int64),
         )
-        means2d, radii = _results.take(filled, 2), _results.take(filled)
+        means2d, radii = take(filled, 2), take(filled)
         written = (self._projections, means2d.reshape(-1), radii)
-        with workers() as run:
-            normals = "normals" in self._wanted
-            run(self._primitive.project, count, gaussians, self._tail, self._view, normals, *written)
+        self._crew.run(self.primitive.project, self._padded(gaussians), self._view, "normals" in self._wanted, *written)
         if count and self._projections.parcels[::2].min() < 0:
             raise UnusableGaussianError
-        return means2d[:count], radii[:count], take("links", self._sums_size(self._outputs, filled))
-
-    def composite(self) -> layout.Images:
-        """Draw the Gaussians projected: [H, W, 3] or [H, W], None where not wanted. May raise TooManyPairsError."""
-        layer = self._main_layer
-        images = self._images(self._wanted, _results.take)
-        with workers() as run:
-            self._bin(run)
-            self._composited = self._arena.take("composited", self._composited_size(layer.outputs))
-            self._sweep(run, self._primitive.sweep_forward, layer, self._composited, _flat_images(images))
-        return images
-
-    def composite_features(self, features: Array) -> Array:
-        """Composite features [N, C] over 0, after :meth:`composite` and over the same bins: [H, W, C].
-
-        Some channels at a time take the place of the others in the records.
-        """
-        grid, width, count = self._grid, self._primitive.feature_channels, features.shape[1]
-        sweeps = -(-count // width)
-        size = self._composited_size(self._feature_outputs)
-        result = np.empty((grid.height, grid.width, width * sweeps), np.float32)
-        self._feature_composited = self._arena.take("feature_composited", sweeps * size)
-        with workers() as run:
-            for sweep in range(sweeps):
-                layer, images = self._features_layer(features, sweep), self._feature_images()
-                composited = self._feature_composited[sweep * size : (sweep + 1) * size]
-                self._sweep(run, self._primitive.sweep_forward, layer, composited, _flat_images(images))
-                result[..., width * sweep : width * (sweep + 1)] = self._joined(images)
-        return result[..., :count]
-
-    def composite_features_backward(self, features: Array, of_features: Array) -> tuple[Array, Array, Array]:
-        """Derivatives of :meth:`composite_features`, given those with respect to its result. [H, W, C]
-
-        Returns the derivative with respect to the projected centres [N, 2], the sums of each Gaussian without those of the
-        channels, and the derivative with respect to the features [N, C].
-        """
-        width, filled, first_sum = self._primitive.feature_channels, self._filled, self._primitive.first_sum
-        size = self._composited_size(self._feature_outputs)
-        part, of_part = self._arena.take("feature_sums", layout.ROW * filled), np.empty((filled, 2), np.float32)
-        total, of_means2d = np.zeros((filled, layout.ROW), np.float32), np.zeros((filled, 2), np.float32)
-        result = np.empty_like(features)
-        with workers() as run:
-            for first in range(0, features.shape[1], width):
-                sweep = first // width
-                of_images = self._feature_images()
-                self._part_into(of_features[..., first : first + width], of_images)
-                layer = self._features_layer(features, sweep)
-                composited = self._feature_composited[sweep * size : (sweep + 1) * size]
-                self._sweep_backward(run, layer, composited, of_images, part, of_part)
-                rows = part.reshape(filled, layout.ROW)
-                total[:, :first_sum] += rows[:, :first_sum]
-                of_means2d += of_part
-                columns = min(width, features.shape[1] - first)
-                result[:, first : first + columns] = rows[: self._count, first_sum : first_sum + columns]
-        sums = np.zeros(self._sums_size(self._outputs, filled), np.float32)
-        sums[: layout.ROW * filled] = total.reshape(-1)
-        return of_means2d[: self._count], sums, result
-
-    def composite_backward(self, of_images: layout.Images) -> tuple[Array, Array]:
-        """Derivatives of :meth:`composite`, any number of times, given those with respect to the images, None where 0.
-
-        Returns the derivative with respect to the projected centres [N, 2], and the sums of each Gaussian, which are good until
-        the next call.
-        """
-        layer, filled = self._main_layer, self._filled
-        gaussian_sums = self._arena.take("gaussian_sums", self._sums_size(layer.outputs, filled))
-        of_means2d = _results.take(filled, 2)
-        with workers() as run:
-            self._sweep_backward(run, layer, self._composited, of_images, gaussian_sums, of_means2d)
-        return of_means2d[: self._count], gaussian_sums
+        self._bin()
+        return means2d[:count], radii[:count], take(self._sums_size(self._outputs, filled))
 
     def project_backward(
         self, gaussians: layout.Parameters, of_means2d: Array | None, gaussian_sums: Array | None
@@ -285,141 +219,239 @@ class Pipeline:
         Returns those with respect to the Gaussians, and to the upper three rows of ``camera_to_world``. [3, 4]
         """
         filled, outputs = self._filled, self._outputs
-        padded = self._arena.take("padded_means2d", 2 * filled)
-        padded[: 2 * self._count] = 0.0 if of_means2d is None else of_means2d.reshape(-1)
-        padded[2 * self._count :] = 0.0
+        centers = np.zeros((filled, 2), np.float32)
+        if of_means2d is not None:
+            centers[: self._count] = of_means2d
         if gaussian_sums is None:
             gaussian_sums = np.zeros(self._sums_size(outputs, filled), np.float32)
-        of_pose = self._arena.take("of_pose", layout.ROW * -(-self._count // layout.PARCEL))
-        results = layout.Parameters(*(_results.take(filled, width) for width in (3, 4, self._primitive.scales, 1, 3)))
+        of_pose = _pool.take(layout.ROW * -(-self._count // layout.PARCEL))
+        results = layout.Parameters(*(_pool.take(filled, width) for width in self._widths))
         flat = layout.Parameters(*(result.reshape(-1) for result in results))
         channels = len(outputs.channels) + len(outputs.normals)
-        tables = (channels, self._projections, gaussian_sums, padded, flat, of_pose)
-        with workers() as run:
-            run(self._primitive.project_backward, self._count, gaussians, self._tail, self._view, *tables)
+        given = (channels, self._projections, gaussian_sums, centers.reshape(-1))
+        self._crew.run(self.primitive.project_backward, self._padded(gaussians), self._view, *given, flat, of_pose)
         columns = of_pose.reshape(-1, layout.ROW)[:, :12].sum(axis=0, dtype=np.float64).reshape(4, 3)
         return layout.Parameters(*(result[: self._count] for result in results)), columns.T
 
-    # --- features -----------------------------------------------------------------------------------------------------
-
-    @property
-    def _feature_outputs(self) -> layout.Outputs:
-        return layout.Outputs(layout.count(self._primitive.feature_channels))
-
-    def _features_layer(self, features: Array, sweep: int) -> Layer:
-        """A part of the features as channels, over black."""
-        width = self._primitive.feature_channels
-        part = features[:, width * sweep : width * (sweep + 1)]
-        records = self._arena.take("feature_records", len(self._projections.records))
-        records[:] = self._projections.records
-        rows = records.reshape(-1, layout.ROW)[: self._count, self._primitive.first_channel :]
-        rows[:, :width] = 0.0
-        rows[:, : part.shape[1]] = part
-        view = self._view.copy()
-        view[layout.VIEW_BACKGROUND : layout.VIEW_BACKGROUND + 3] = 0.0
-        return Layer(self._projections._replace(records=records), view, self._feature_outputs)
-
-    def _feature_images(self) -> layout.Images:
-        """Images for the channels of a sweep."""
-        return self._images(self._primitive.feature_images, lambda *shape: np.zeros(shape, np.float32))
-
-    def _images(self, names: Collection[str], make: Callable[..., Array]) -> layout.Images:
-        """Images of these names made from their shapes, None for the others."""
-        size = (self._grid.height, self._grid.width)
-        shapes = {name: (*size, 3) if name in ("rgb", "normals") else size for name in names}
-        return layout.Images(*(make(*shapes[name]) if name in names else None for name in layout.Images._fields))
-
-    def _joined(self, images: layout.Images) -> Array:
-        """The channels of a sweep from the images that hold them. [H, W, feature_channels]"""
-        size = (self._grid.height, self._grid.width, -1)
-        parts = [getattr(images, name).reshape(size) for name in self._primitive.feature_images]
-        return np.concatenate(parts, axis=-1)[..., : self._primitive.feature_channels]
-
-    def _part_into(self, channels: Array, images: layout.Images) -> None:
-        """Split at most as many channels into images; the inverse of :meth:`_joined`. [H, W, C]"""
-        size, first = (self._grid.height, self._grid.width, -1), 0
-        for name in self._primitive.feature_images:
-            image = getattr(images, name).reshape(size)
-            part = channels[..., first : first + image.shape[2]]
-            image[..., : part.shape[2]] = part
-            first += image.shape[2]
-
-    # --- bins ---------------------------------------------------------------------------------------------------------
-
-    def _bin(self, run: Runner) -> None:
-        """List the Gaussians of each tile."""
-        take, grid = self._arena.take, self._grid
-        drawn, within_bounds = (int(total) for total in self._projections.parcels.reshape(-1, 2).sum(axis=0))
-        if within_bounds > _MOST_PAIRS:
-            raise TooManyPairsError(within_bounds)
-        stretches = run.workers * _PIECES if run.workers > 1 else 1
-        self._bins = bins = layout.Bins(
-            keys=self._sorted_keys(run, drawn),
-            entry_counts=take("entry_counts", drawn, np.int32),
-            stretch_entries=take("stretch_entries", stretches + 1, np.int64),
-            cells=take("cells", layout.CELL * within_bounds, np.int32),
-            starts=take("starts", grid.tiles + 1, np.int64),
-            order=take("order", grid.tiles, np.int64),
-            reached=take("reached", grid.tiles, np.int64),
-        )
-        pairs = layout.Pairs(
-            gaussian=take("pair_gaussian", within_bounds, np.int32),
-            tile=take("pair_tile", within_bounds, np.int32),
-            blocks=take("pair_blocks", within_bounds, np.int32),
-            begins=take("pair_begins", stretches, np.int64),
-            ends=take("pair_ends", stretches, np.int64),
-            tile_counts=take("tile_counts", stretches * grid.tiles, np.int32),
-        )
-        circle = layout.count(self._primitive.circle)
-        run(binning.find_pairs, self._projections, self._view, grid, circle, bins.keys, pairs, bins.entry_counts)
-        binning.place_entries(grid, pairs, bins)
-        run(binning.sort_pairs, grid, pairs, bins)
-
-    def _sorted_keys(self, run: Runner, drawn: int) -> Array:
-        """Indices of the Gaussians drawn, nearest first."""
-        take = self._arena.take
-        keys, moved = take("keys", drawn, np.int64), take("moved", drawn, np.int64)
-        if not drawn:
-            return keys
-        if drawn < _WORTH_SHARING_SORT:
-            run = Runner(1)
-        counts = self._projections.parcels[::2]
-        lowest, highest = np.empty_like(counts), np.empty_like(counts)
-        depth_bits = self._projections.depths.view(np.int32)
-        run(binning.collect, depth_bits, self._projections.drawn, np.cumsum(counts) - counts, keys, lowest, highest)
-        least = int(lowest.min())
-        significant = (int(highest.max()) - least).bit_length()
-        passes = -(-significant // binning.DIGIT_BITS)
-        digits = take("digits", run.workers * binning.DIGITS, np.int32)
-        for turn in range(passes):
-            width = -(-significant // passes)
-            arguments = (run.workers, keys, least, turn * width, (1 << width) - 1, digits)
-            run(binning.count_digits, *arguments)
-            binning.place_digits(run.workers, (1 << width) - 1, digits)
-            run(binning.move_by_digit, *arguments, moved)
-            keys, moved = moved, keys
-        return keys
-
     @property
     def _filled(self) -> int:
-        """Gaussians with the last group filled up."""
+        """Number of Gaussians with the last group filled up."""
         return self._count + -self._count % layout.GROUP
 
-    def _composited_size(self, outputs: layout.Outputs) -> int:
-        """Numbers that a forward sweep leaves."""
-        return 16 * layout.BLOCKS * self._grid.tiles * tiles.composited_vectors(outputs)
+    @property
+    def _widths(self) -> tuple[int, ...]:
+        """Numbers of a Gaussian in each of ``layout.Parameters``."""
+        return 3, 4, self.primitive.scales, 1, 3
+
+    def _padded(self, gaussians: layout.Parameters) -> layout.Parameters:
+        """The Gaussians with the last group filled up by ones that are not drawn."""
+        padded = []
+        for array, width, filling in zip(gaussians, self._widths, (0.0, 1.0, 0.0, 0.0, 0.0), strict=True):
+            whole = array
+            if self._filled > self._count:
+                whole = _pool.take(width * self._filled)
+                whole[: len(array)], whole[len(array) :] = array, filling
+            padded.append(whole)
+        return layout.Parameters(*padded)
+
+    def _bin(self) -> None:
+        """List the Gaussians of each tile, front to back."""
+        take, grid, crew = _pool.take, self._grid, self._crew
+        nearest_first = self._nearest_first()
+        drawn, within_bounds = len(nearest_first), int(self._projections.parcels[1::2].sum())
+        if within_bounds > _MOST_PAIRS:
+            raise TooManyPairsError(within_bounds)
+        stretches = crew.size * _PIECES if crew.size > 1 else 1
+        pairs = layout.Pairs(
+            *(take(within_bounds, dtype=np.int32) for _ in range(3)),
+            begins=take(stretches, dtype=np.int64),
+            ends=take(stretches, dtype=np.int64),
+            tile_counts=take(stretches * grid.tiles, dtype=np.int32),
+        )
+        entry_counts, circle = take(drawn, dtype=np.int32), layout.count(self.primitive.circle)
+        given = (self._projections, self._view, grid, circle, nearest_first)
+        crew.run(binning.find_pairs, *given, pairs, entry_counts)
+        counts = pairs.tile_counts.reshape(stretches, grid.tiles)
+        ends = counts.T.cumsum(dtype=np.int64).reshape(grid.tiles, stretches)
+        counts[:] = ends.T - counts
+        starts = np.append(0, ends[:, -1])
+        self._bins = layout.Bins(
+            nearest_first=nearest_first,
+            entry_counts=entry_counts,
+            stretch_entries=np.append(0, np.cumsum(pairs.ends - pairs.begins)),
+            cells=take(layout.CELL * within_bounds, dtype=np.int32),
+            starts=starts,
+            order=np.argsort(-np.diff(starts), kind="stable"),
+            reached=take(grid.tiles, dtype=np.int64),
+        )
+        crew.run(binning.sort_pairs, grid, pairs, self._bins)
+
+    def _nearest_first(self) -> Array:
+        """Indices of the Gaussians drawn; those of equal depth keep their order."""
+        flags = self._projections.drawn[:, None] >> np.arange(layout.GROUP)
+        index = np.flatnonzero(flags & 1)
+        # The bits of positive floats order as the numbers do; numpy's stable sort of 16 bits is a radix sort.
+        for shift in (0, 16):
+            digits = (self._projections.depths[index].view(np.uint32) >> shift).astype(np.uint16)
+            index = index[np.argsort(digits, kind="stable")]
+        return index
+
+    # --- compositing --------------------------------------------------------------------------------------------------
+
+    def layer(self, colors: Array | None) -> Layer:
+        """All images wanted; or other colours alone, over black. [N, 3]"""
+        if colors is None:
+            return Layer(self._projections, self._view, self._outputs, self._wanted)
+        records, view = self._projections.records.copy(), self._view.copy()
+        first = self.primitive.first_channel
+        self._rows(records)[:, first : first + 3] = colors
+        view[layout.VIEW_BACKGROUND : layout.VIEW_BACKGROUND + 3] = 0.0
+        return Layer(self._projections._replace(records=records), view, layout.Outputs(layout.count(3)), ("rgb",))
+
+    def composite(self, layer: Layer) -> tuple[layout.Images, Array]:
+        """Images, [H, W, 3] or [H, W], None where not wanted; and what :meth:`composite_backward` needs."""
+        size = (self._grid.height, self._grid.width)
+        shapes = {name: (*size, 3) if name in ("rgb", "normals") else size for name in layer.images}
+        images = [_pool.take(*shapes[name]) if name in shapes else None for name in layout.Images._fields]
+        vectors = layout.BLOCKS * self._grid.tiles * tiles.composited_vectors(layer.outputs)
+        composited = _pool.take(16 * vectors)
+        self._sweep(self.primitive.sweep_forward, layer, composited, _flat_images(images))
+        return layout.Images(*images), composited
+
+    def composite_backward(
+        self, layer: Layer, composited: Array, of_images: Iterable[Array | None]
+    ) -> tuple[Array, Array]:
+        """Derivatives of :meth:`composite`, given those with respect to the images, None where 0.
+
+        Returns the derivative with respect to the projected centres [N, 2], and the sums of each Gaussian.
+        """
+        filled, seventeen = self._filled, self._sums(layer.outputs) > layout.ROW
+        entry_sums = _pool.take(self._sums_size(layer.outputs, int(self._bins.starts[-1])))
+        sums, of_means2d = _pool.take(self._sums_size(self._outputs, filled)), _pool.take(filled, 2)
+        sums[layout.ROW * filled :] = 0.0
+        self._sweep(self.primitive.sweep_backward, layer, composited, _flat_images(of_images), seventeen, entry_sums)
+        gathered = (seventeen, entry_sums, sums, of_means2d.reshape(-1))
+        self._crew.run(self.primitive.gather, layer.projections, self._bins, layer.view, *gathered)
+        return of_means2d[: self._count], sums
+
+    def split_colors(self, sums: Array) -> Array:
+        """Take the derivative with respect to a layer's colours, [N, 3], out of its sums, which leaves 0 behind."""
+        channels = self._rows(sums)[:, self.primitive.first_sum :]
+        of_colors = channels[:, :3].copy()
+        channels[:] = 0.0
+        return of_colors
+
+    def _rows(self, table: Array) -> Array:
+        """The rows of all Gaussians in a table of records or sums. [N, 16]"""
+        return table[: layout.ROW * self._count].reshape(-1, layout.ROW)
+
+    def _sums(self, outputs: layout.Outputs) -> int:
+        """Number of sums of each Gaussian and entry."""
+        return self.primitive.first_sum + len(outputs.channels) + len(outputs.normals)
+
+    def _sums_size(self, outputs: layout.Outputs, rows: int) -> int:
+        """Length of the table of sums of ``rows`` Gaussians or entries: 16 floats each, 17 if there are too many sums."""
+        return (layout.ROW + (self._sums(outputs) > layout.ROW)) * rows
+
+    def _sweep(self, kernel: Callable[..., None], layer: Layer, *tables: Any) -> None:
+        """Run a sweep, which takes or writes the tables."""
+        threads = self._crew.size
+        integers = _pool.take(threads * tiles.INTEGERS, dtype=np.int32)
+        scratch = layout.Scratch(_pool.take(threads * tiles.NUMBERS), integers)
+        self._crew.run(kernel, layer.projections, self._bins, layer.view, self._grid, layer.outputs, scratch, *tables)
 
 
-def _flat_images(images: layout.Images) -> layout.Images:
+def _flat_images(images: Iterable[Array | None]) -> layout.Images:
     return layout.Images(*(np.empty(0, np.float32) if image is None else image.reshape(-1) for image in images))
 
 
-def _tail(gaussians: layout.Parameters, count: int, scales: int) -> layout.Parameters:
-    """The Gaussians behind the last full group, filled up with ones that are not drawn."""
-    first = count // layout.GROUP * layout.GROUP
-    tails = []
-    for array, width, filling in zip(gaussians, (3, 4, scales, 1, 3), (0.0, 1.0, 0.0, 0.0, 0.0), strict=True):
-        tail = np.full(layout.GROUP * width, filling, np.float32)
-        tail[: width * (count - first)] = array[width * first :]
-        tails.append(tail)
-    return layout.Parameters(*tails)
+# --- autograd ---------------------------------------------------------------------------------------------------------
+
+
+def render(
+    gaussians: Iterable[Tensor], features: Sequence[Tensor], pose: Tensor, pipeline: Pipeline
+) -> tuple[Tensor, Tensor, dict[str, Tensor], Sequence[Tensor]]:
+    """Render one view on a new pipeline; differentiable, once, in all tensors.
+
+    ``gaussians`` are float32 tensors on the CPU, checked for shape, in the order of ``layout.Parameters``; ``features`` are
+    further channels to composite, [N, C] each; ``pose`` is the camera_to_world that the pipeline was made with.
+
+    Returns:
+        means2d, which holds its gradient after ``backward``; radii; the images by the names of ``layout.Images``, None where
+        not wanted; and the features' images, [H, W, C] each.
+
+    Raises:
+        UnusableGaussianError, TooManyPairsError: See :meth:`Pipeline.project`.
+    """
+    means2d, links, radii = _Project.apply(*gaussians, pose, pipeline)  # type: ignore[no-untyped-call]
+    if means2d.requires_grad:
+        means2d.retain_grad()
+    images = _Composite.apply(means2d, links, None, pipeline)  # type: ignore[no-untyped-call]
+    by_name = dict(zip(layout.Images._fields, images, strict=True))
+    if not features:
+        return means2d, radii, by_name, ()
+    widths = [feature.shape[1] for feature in features]
+    channels = torch.nn.functional.pad(torch.cat(list(features), dim=1), (0, -sum(widths) % 3))
+    parts = [_Composite.apply(means2d, links, part, pipeline)[0] for part in channels.split(3, dim=1)]  # type: ignore[no-untyped-call]
+    return means2d, radii, by_name, torch.cat(parts, dim=-1)[..., : sum(widths)].split(widths, dim=-1)
+
+
+class _Project(torch.autograd.Function):
+    """Gaussians -> projected centres, links, radii."""
+
+    @staticmethod
+    def forward(ctx: FunctionCtx, *arguments: Tensor | Pipeline) -> tuple[Tensor, Tensor, Tensor]:
+        *gaussians, _, pipeline = arguments
+        means2d, radii, links = (torch.from_numpy(array) for array in pipeline.project(_flat_gaussians(gaussians)))
+        ctx.save_for_backward(*gaussians)
+        ctx.pipeline = pipeline
+        ctx.set_materialize_grads(False)
+        ctx.mark_non_differentiable(radii)
+        return means2d, links, radii
+
+    @staticmethod
+    @once_differentiable
+    def backward(
+        ctx: FunctionCtx, of_means2d: Tensor | None, sums: Tensor | None, of_radii: None
+    ) -> tuple[Tensor | None, ...]:
+        gaussians = _flat_gaussians(ctx.saved_tensors)
+        derivatives, of_pose = ctx.pipeline.project_backward(gaussians, _array(of_means2d), _array(sums))
+        means, quats, scales, opacities, colors = (torch.from_numpy(array) for array in derivatives)
+        pose = torch.zeros(4, 4)
+        pose[:3] = torch.from_numpy(of_pose)
+        return means, quats, scales, opacities[:, 0], colors, pose, None
+
+
+class _Composite(torch.autograd.Function):
+    """Projected centres and links -> images; or, of other colours than the Gaussians' own, one image. [N, 3]"""
+
+    @staticmethod
+    def forward(
+        ctx: FunctionCtx, means2d: Tensor, links: Tensor, colors: Tensor | None, pipeline: Pipeline
+    ) -> tuple[Tensor | None, ...]:
+        ctx.pipeline, ctx.recolored = pipeline, colors is not None
+        ctx.layer = pipeline.layer(_array(colors))
+        arrays, ctx.composited = pipeline.composite(ctx.layer)
+        images = layout.Images(*(None if array is None else torch.from_numpy(array) for array in arrays))
+        ctx.set_materialize_grads(False)
+        constant = [getattr(images, name) for name in pipeline.primitive.constant_images]
+        ctx.mark_non_differentiable(*(image for image in constant if image is not None))
+        return tuple(images)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: FunctionCtx, *of_images: Tensor | None) -> tuple[Tensor | None, ...]:
+        if all(gradient is None for gradient in of_images):
+            return None, None, None, None
+        arrays = [_array(gradient) for gradient in of_images]
+        of_means2d, sums = ctx.pipeline.composite_backward(ctx.layer, ctx.composited, arrays)
+        of_colors = torch.from_numpy(ctx.pipeline.split_colors(sums)) if ctx.recolored else None
+        return torch.from_numpy(of_means2d), torch.from_numpy(sums), of_colors, None
+
+
+def _array(tensor: Tensor | None) -> Array | None:
+    return None if tensor is None else tensor.detach().contiguous().numpy()
+
+
+def _flat_gaussians(tensors: Iterable[Tensor]) -> layout.Parameters:
+    return layout.Parameters(*tables(*tensors))

@@ -35,25 +35,19 @@ _LARGEST_SLOPE = 1e10
 def projecting(project_groups: Callable[..., tuple[int, int]]) -> Callable[..., None]:
     """Compile the kernel that projects all Gaussians, parcel by parcel, and computes their extents.
 
-    It writes ``projections``, ``means2d`` in pixels and ``radii`` in pixels, 0 where not drawn. ``tail`` are the Gaussians
-    behind the last full group, filled up with ones that are not drawn; ``normals`` says whether normals are composited.
+    It writes ``projections``, ``means2d`` in pixels and ``radii`` in pixels, 0 where not drawn; ``normals`` says whether
+    normals are composited.
 
-    ``project_groups`` projects groups ``first`` to ``last``, reading from group ``source`` of the Gaussians on. It returns
-    the number of Gaussians drawn, -1 where one is invalid; and the number of tiles within their bounds.
+    ``project_groups`` projects groups ``first`` to ``last``. It returns the number of Gaussians drawn, -1 where one is
+    invalid; and the number of tiles within their bounds.
     """
 
     @kernel
-    def project(counters, count, gaussians, tail, view, normals, projections, means2d, radii):
-        whole_groups = count // layout.GROUP
-        per_parcel = layout.PARCEL // layout.GROUP
-        for parcel in pieces(counters, 0, -(-count // layout.PARCEL)):
-            first = parcel * per_parcel
-            last = min(first + per_parcel, whole_groups)
-            drawn, tiles = project_groups(first, last, first, gaussians, view, normals, projections, means2d, radii)
-            if last * layout.GROUP < min((parcel + 1) * layout.PARCEL, count):
-                more, more_tiles = project_groups(last, last + 1, 0, tail, view, normals, projections, means2d, radii)
-                drawn = -1 if drawn < 0 or more < 0 else drawn + more
-                tiles += more_tiles
+    def project(counters, gaussians, view, normals, projections, means2d, radii):
+        groups, per_parcel = len(projections.drawn), layout.PARCEL // layout.GROUP
+        for parcel in pieces(counters, 0, len(projections.parcels) // 2):
+            first, last = parcel * per_parcel, min((parcel + 1) * per_parcel, groups)
+            drawn, tiles = project_groups(first, last, gaussians, view, normals, projections, means2d, radii)
             projections.parcels[2 * parcel] = drawn
             projections.parcels[2 * parcel + 1] = tiles
 
@@ -64,7 +58,7 @@ def projecting(project_groups: Callable[..., tuple[int, int]]) -> Callable[..., 
 
 
 @part
-def _project_gaussians(first, last, source, gaussians, view, normals, projections, means2d, radii):
+def _project_gaussians(first, last, gaussians, view, normals, projections, means2d, radii):
     """Project groups of 3D Gaussians: see :func:`projecting`."""
     drawn, tiles, usable = 0, 0, True
     three = (0, 0, 0)
@@ -73,7 +67,7 @@ def _project_gaussians(first, last, source, gaussians, view, normals, projection
     right_edge = vec.sub(vec.broadcast(view, layout.VIEW_WIDTH), 0.5)
     bottom_edge = vec.sub(vec.broadcast(view, layout.VIEW_HEIGHT), 0.5)
     for group in range(first, last):
-        row = layout.GROUP * (group - first + source)
+        row = layout.GROUP * group
         mean = vec.load_columns(gaussians.means, 3 * row, three)
         scale = vec.load_columns(gaussians.scales, 3 * row, three)
         quat, opacity = vec.load_columns(gaussians.quats, 4 * row, (0, 0, 0, 0)), vec.load(gaussians.opacities, row)
@@ -103,7 +97,7 @@ def _project_gaussians(first, last, source, gaussians, view, normals, projection
         shown = vec.both(vec.both(at.in_front, vec.at_least(reach, 0.0)), vec.at_most(nearest, reach))
         tau = vec.mul(reach, 1.0 / layout.U_FACTOR_SQUARED)
         half = vec.larger(vec.sqrt(vec.mul(tau, xx)), vec.sqrt(vec.mul(tau, yy)))
-        vec.store(radii, layout.GROUP * group, vec.select(shown, vec.ceil(half), 0.0))
+        vec.store(radii, row, vec.select(shown, vec.ceil(half), 0.0))
 
         tau = vec.mul(vec.add(reach, layout.REACH_SLACK), 1.0 / layout.U_FACTOR_SQUARED)
         half_x, half_y = vec.sqrt(vec.mul(tau, xx)), vec.sqrt(vec.mul(tau, yy))
@@ -112,12 +106,12 @@ def _project_gaussians(first, last, source, gaussians, view, normals, projection
         more, more_tiles = store_extents(group, shown, columns, rows, projections)
         drawn, tiles = drawn + more, tiles + more_tiles
 
-        vec.store_columns(means2d, 2 * layout.GROUP * group, (mean_x, mean_y))
-        vec.store(projections.depths, layout.GROUP * group, at.z)
+        vec.store_columns(means2d, 2 * row, (mean_x, mean_y))
+        vec.store(projections.depths, row, at.z)
         normal = _facing_normals(at, scale, view) if normals else vec.repeat(0.0, three)
         whole = (u_xx, u_yx, u_yy, mean_x, mean_y, log2_opacity) + color
         whole = whole + (at.z, at.inverse_z) + normal + (slope_upright, slope_level)
-        vec.store_columns(projections.records, layout.ROW * layout.GROUP * group, whole)
+        vec.store_columns(projections.records, layout.ROW * row, whole)
     return (drawn if usable else -1), tiles
 
 
@@ -165,7 +159,7 @@ def tile_at(position, edge):
 
 
 @part
-def _project_surfels(first, last, source, surfels, view, _normals, projections, means2d, radii):
+def _project_surfels(first, last, surfels, view, _normals, projections, means2d, radii):
     """Project groups of surfels, always with normals: see :func:`projecting`."""
     drawn, tiles, usable = 0, 0, True
     three = (0, 0, 0)
@@ -177,7 +171,7 @@ def _project_surfels(first, last, source, surfels, view, _normals, projections, 
     right_edge, bottom_edge = vec.sub(width, 0.5), vec.sub(height, 0.5)
     half_size = vec.mul(0.5, vec.larger(width, height))
     for group in range(first, last):
-        row = layout.GROUP * (group - first + source)
+        row = layout.GROUP * group
         mean, scale = vec.load_columns(surfels.means, 3 * row, three), vec.load_columns(surfels.scales, 2 * row, (0, 0))
         quat, opacity = vec.load_columns(surfels.quats, 4 * row, (0, 0, 0, 0)), vec.load(surfels.opacities, row)
         color = vec.load_columns(surfels.colors, 3 * row, three)
@@ -191,7 +185,7 @@ def _project_surfels(first, last, source, surfels, view, _normals, projections, 
         wide_y = vec.fma(fy, slope_y, vec.broadcast(view, layout.VIEW_CY))
         mean_x, mean_y = vec.narrow(wide_x), vec.narrow(wide_y)
         remainder = vec.narrow((vec.sub(wide_x, mean_x), vec.sub(wide_y, mean_y)))
-        vec.store_columns(projections.remainders, 2 * layout.GROUP * group, remainder)
+        vec.store_columns(projections.remainders, 2 * row, remainder)
         per_x, per_y = vec.div(at.z, vec.mul(fx, pixel_scale)), vec.div(at.z, vec.mul(fy, pixel_scale))
         u_x, u_y = _slopes(at.of_first, right, down, per_x, per_y, scale[0])
         v_x, v_y = _slopes(at.of_second, right, down, per_x, per_y, scale[1])
@@ -241,7 +235,7 @@ def _project_surfels(first, last, source, surfels, view, _normals, projections, 
         top = vec.smaller(vec.sub(center_y, half_y), vec.sub(mean_y, radius))
         bottom = vec.larger(vec.add(center_y, half_y), vec.add(mean_y, radius))
         half = vec.select(crosses, half_size, vec.mul(0.5, vec.larger(vec.sub(end, left), vec.sub(bottom, top))))
-        vec.store(radii, layout.GROUP * group, vec.select(shown, vec.ceil(half), 0.0))
+        vec.store(radii, row, vec.select(shown, vec.ceil(half), 0.0))
         left, end = vec.select(crosses, 0.0, left), vec.select(crosses, right_edge, end)
         top, bottom = vec.select(crosses, 0.0, top), vec.select(crosses, bottom_edge, bottom)
         columns = (tile_at(left, right_edge), tile_at(end, right_edge))
@@ -257,14 +251,14 @@ def _project_surfels(first, last, source, surfels, view, _normals, projections, 
         more, more_tiles = store_extents(group, shown, columns, rows, projections)
         drawn, tiles = drawn + more, tiles + more_tiles
 
-        vec.store_columns(means2d, 2 * layout.GROUP * group, (mean_x, mean_y))
-        vec.store(projections.depths, layout.GROUP * group, z)
+        vec.store_columns(means2d, 2 * row, (mean_x, mean_y))
+        vec.store(projections.depths, row, z)
         u_xx, u_yy = vec.select(crosses, (0.0, largest_q), (u_xx, u_yy))
         outline = (u_xx, u_yx, u_yy, center_x, center_y, log2_opacity, mean_x, mean_y)
         outline = outline + slopes + (slope_upright, slope_level)
-        vec.store_columns(projections.outlines, layout.ROW * layout.GROUP * group, outline)
+        vec.store_columns(projections.outlines, layout.ROW * row, outline)
         record = slopes + (mean_x, mean_y, log2_opacity, z) + color + normal
-        vec.store_columns(projections.records, layout.ROW * layout.GROUP * group, record)
+        vec.store_columns(projections.records, layout.ROW * row, record)
     return (drawn if usable else -1), tiles
 
 

@@ -21,7 +21,6 @@ from coliags_plugin.core.numba_kernels import lanes as vec
 from coliags_plugin.core.numba_kernels.compilation import inline, kernel, part
 from coliags_plugin.core.numba_kernels.threads import pieces
 from coliags_plugin.renderers.numba_kernels import layout
-from coliags_plugin.renderers.numba_kernels.binning import NUMBER
 from coliags_plugin.renderers.numba_kernels.geometry import (
     camera_axes,
     place_surfels,
@@ -48,12 +47,9 @@ def gathering(of_center: Callable[..., tuple[float, float]]) -> Callable[..., No
 
     @kernel
     def gather(counters, projections, bins, view, seventeen, entry_sums, gaussian_sums, of_means2d):
-        groups, count, stretches = len(projections.drawn), len(bins.keys), len(bins.stretch_entries) - 1
-        records, entries_further, further = (
-            projections.records,
-            layout.ROW * bins.starts[-1],
-            layout.ROW * layout.GROUP * groups,
-        )
+        groups, count, stretches = len(projections.drawn), len(bins.nearest_first), len(bins.stretch_entries) - 1
+        records, further = projections.records, layout.ROW * layout.GROUP * groups
+        entries_further = layout.ROW * bins.starts[-1]
         for group in pieces(counters, 0, groups):
             flags = projections.drawn[group] ^ 0xFFFF
             while flags:
@@ -68,11 +64,11 @@ def gathering(of_center: Callable[..., tuple[float, float]]) -> Callable[..., No
             first, last = count * stretch // stretches, count * (stretch + 1) // stretches
             entry = bins.stretch_entries[stretch]
             for place in range(first, last):
-                ahead = bins.keys[min(place + _AHEAD, last - 1)] & NUMBER
+                ahead = bins.nearest_first[min(place + _AHEAD, last - 1)]
                 vec.prefetch(records, layout.ROW * ahead)
                 vec.prefetch_to_write(gaussian_sums, layout.ROW * ahead)
                 vec.prefetch_to_write(of_means2d, 2 * ahead)
-                index = bins.keys[place] & NUMBER
+                index = bins.nearest_first[place]
                 total, last_total = vec.splat(0.0), np.float32(0.0)
                 for _ in range(bins.entry_counts[place]):
                     total = vec.add(total, vec.load(entry_sums, layout.ROW * entry))
@@ -93,27 +89,20 @@ def projecting_backward(project_groups: Callable[..., tuple]) -> Callable[..., N
     ``channels`` is the number of channels composited; ``of_pose`` gets the derivatives with respect to the camera's three
     axes and its centre in the world, one row for each parcel.
 
-    ``project_groups`` is the backward pass of a range of groups, and returns ``pose``, the derivatives with respect to the
-    camera's axes and centre, with those of these groups added.
+    ``project_groups`` is the backward pass of groups ``first`` to ``last``, and returns the derivatives with respect to
+    the camera's axes and centre.
     """
 
     @kernel
     def project_backward(
-        counters, count, gaussians, tail, view, channels, projections, gaussian_sums, of_means2d, of_gaussians, of_pose
+        counters, gaussians, view, channels, projections, gaussian_sums, of_means2d, of_gaussians, of_pose
     ):
-        whole_groups = count // layout.GROUP
-        per_parcel = layout.PARCEL // layout.GROUP
-        for parcel in pieces(counters, 0, -(-count // layout.PARCEL)):
-            first = parcel * per_parcel
-            last = min(first + per_parcel, whole_groups)
+        groups, per_parcel = len(projections.drawn), layout.PARCEL // layout.GROUP
+        for parcel in pieces(counters, 0, len(projections.parcels) // 2):
+            first, last = parcel * per_parcel, min((parcel + 1) * per_parcel, groups)
             pose = project_groups(
-                first, last, first, vec.repeat(0.0, (0,) * 12), gaussians, view, channels, projections, gaussian_sums,
-                of_means2d, of_gaussians,
-            )  # fmt: skip
-            if last * layout.GROUP < min((parcel + 1) * layout.PARCEL, count):
-                pose = project_groups(
-                    last, last + 1, 0, pose, tail, view, channels, projections, gaussian_sums, of_means2d, of_gaussians
-                )
+                first, last, gaussians, view, channels, projections, gaussian_sums, of_means2d, of_gaussians
+            )
             vec.store(of_pose, layout.ROW * parcel, vec.lane_sums(pose))
 
     return project_backward
@@ -133,22 +122,21 @@ def _of_gaussian_center(total, records, row, view):
 
 @part
 def _project_gaussians_backward(
-    first, last, source, pose, gaussians, view, channels, projections, gaussian_sums, given_means2d, of_gaussians
+    first, last, gaussians, view, channels, projections, gaussian_sums, given_means2d, of_gaussians
 ):
     """Groups of 3D Gaussians: see :func:`projecting_backward`."""
     three = (0, 0, 0)
     right, down, forward = camera_axes(view)
     fx, fy = vec.broadcast(view, layout.VIEW_FX), vec.broadcast(view, layout.VIEW_FY)
-    of_right, of_down, of_forward, of_center = pose[0:3], pose[3:6], pose[6:9], pose[9:12]
     nothing = vec.repeat(0.0, three)
+    of_right, of_down, of_forward, of_center = nothing, nothing, nothing, nothing
     for group in range(first, last):
         shown = vec.from_bits(projections.drawn[group])
-        row = layout.GROUP * (group - first + source)
+        row = layout.GROUP * group
         mean = vec.load_columns(gaussians.means, 3 * row, three)
         scale = vec.load_columns(gaussians.scales, 3 * row, three)
         quat, opacity = vec.load_columns(gaussians.quats, 4 * row, (0, 0, 0, 0)), vec.load(gaussians.opacities, row)
         at = project_axes(mean, quat, view)
-        row = layout.GROUP * group
         sums = vec.load_columns(gaussian_sums, layout.ROW * row, (0,) * 16)
         by_x, by_y = vec.load_columns(given_means2d, 2 * row, (0, 0))
 
@@ -266,7 +254,7 @@ def _of_surfel_center(total, records, row, view):
 
 @part
 def _project_surfels_backward(
-    first, last, source, pose, surfels, view, channels, projections, surfel_sums, given_means2d, of_surfels
+    first, last, surfels, view, channels, projections, surfel_sums, given_means2d, of_surfels
 ):
     """Groups of surfels: see :func:`projecting_backward`."""
     drawn = projections.drawn
@@ -274,15 +262,14 @@ def _project_surfels_backward(
     right, down, forward = camera_axes(view)
     fx, fy = vec.broadcast(view, layout.VIEW_FX), vec.broadcast(view, layout.VIEW_FY)
     filtered = vec.mul(_PLAIN_SQUARE, vec.broadcast(view, layout.VIEW_PIXEL_SCALE))
-    of_right, of_down, of_forward, of_center = pose[0:3], pose[3:6], pose[6:9], pose[9:12]
     nothing, channel = vec.repeat(0.0, three), layout.SURFEL_SUM_CHANNELS
+    of_right, of_down, of_forward, of_center = nothing, nothing, nothing, nothing
     for group in range(first, last):
         shown = vec.from_bits(drawn[group])
-        row = layout.GROUP * (group - first + source)
+        row = layout.GROUP * group
         mean, scale = vec.load_columns(surfels.means, 3 * row, three), vec.load_columns(surfels.scales, 2 * row, (0, 0))
         quat, opacity = vec.load_columns(surfels.quats, 4 * row, (0, 0, 0, 0)), vec.load(surfels.opacities, row)
         at = place_surfels(mean, quat, view)
-        row = layout.GROUP * group
         sums = vec.load_columns(surfel_sums, layout.ROW * row, (0,) * 16)
         by_x, by_y = vec.load_columns(given_means2d, 2 * row, (0, 0))
 

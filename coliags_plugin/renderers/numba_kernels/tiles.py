@@ -239,18 +239,3 @@ def _copy_from_image(image, depth, channel, tile, grid, vector, state):
             first = ((corner_y + y) * grid.width + corner_x) * depth + channel
             for x in range(across):
                 state[vector + place_in_blocks(x, y)] = vec.number(image, first + x * depth)
-
-
-@part
-def order_tiles(starts, order):
-    """Order tiles by decreasing length of their lists, to balance the threads.
-
-    Sorted approximately, by the bit length of the number of entries.
-    """
-    place = 0
-    for digits in range(32, -1, -1):
-        for tile in range(len(starts) - 1):
-            count = starts[tile + 1] - starts[tile]
-            if count >> digits == 1 or (count == 0 and digits == 0):
-                order[place] = tile
-                place += 1
