@@ -152,7 +152,7 @@ SURFELS = Primitive(
 
 
 class Layer(NamedTuple):
-    """What a forward and a backward sweep composite: projected Gaussians, the view, the numbers, and images by name."""
+    """Input of a forward and a backward sweep: projected Gaussians, the view, numbers to composite, and images by name."""
 
     projections: layout.Projections
     view: Array
