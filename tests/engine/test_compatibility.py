@@ -57,12 +57,6 @@ def test_what_was_made_from_held_out_images_is_warned_of(tmp_path, caplog):
         ("scaffold-gs", ["optimizers.mirrors={lr: 0.1}"], "optimizers names mirrors, which the model does not have"),
         ("scaffold-gs", ["optimizers.features=null"], "optimizers lacks the parameter groups features"),
         ("scaffold-gs", ["modules.exposure=gain"], "optimizers lacks the parameter groups exposure.gain"),
-        (
-            "scaffold-gs",
-            ["modules.exposure={name: gain, reference: '0099'}", 'optimizers."exposure.gain"={lr: 0.1}'],
-            "gain names frame '0099'",
-        ),
-        ("scaffold-gs", ["modules.poses={name: pose-correction, fixed: ['7']}"], "pose-correction names frame '7'"),
         ("scaffold-gs", ["renderer=volume"], "renderer 'volume' draws radiance, the field is made of gaussians3d"),
         (
             "scaffold-gs",
