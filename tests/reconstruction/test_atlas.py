@@ -296,7 +296,7 @@ def halves(tmp_path_factory):
     images = images_of(folder, tube_frames(LONG, 1.0))
     with quiet_colmap(0):
         video = read_video(images, TRACKED)
-        (whole,) = video.mapped(TRACKED, candidate_cameras(TRACKED.camera, tracked=True)[0][0], None)
+        (whole,) = video.mapped(candidate_cameras(TRACKED.camera, tracked=True)[0][0])
     parts = [part_of(whole, range(HALF)), part_of(whole, range(HALF, LONG))]
     parts[1].transform(pycolmap.Sim3d(SCALE, pycolmap.Rotation3d(TURN), MOVE))
     return video, whole, [Hypothesis.of(part, video.brightness) for part in parts]
@@ -306,7 +306,7 @@ def halves(tmp_path_factory):
 def test_models_of_the_same_wall_become_one(halves):
     video, whole, parts = halves
     with quiet_colmap(0):
-        extended, (joined,), apart = join_models(video, parts, TRACKED)
+        extended, (joined,), apart = join_models(video, parts)
     assert apart == {}
     assert joined.frames == list(range(LONG))
     again = joined.joins[HALF - 1]
@@ -330,13 +330,13 @@ def test_models_of_the_same_wall_become_one(halves):
 @pytest.mark.parametrize("moves", [False, True])
 def test_models_that_are_too_long_together_are_related(halves, moves, monkeypatch):
     video, _, parts = halves
-    short = TRACKED
     if moves:
         monkeypatch.setattr(joining, "rigid_frames", lambda model, tracks: LONG - 1)
     else:
         short = TRACKED.model_copy(update={"tracks": TrackSettings(longest_window=LONG - 1)})
+        video = replace(video, settings=short)
     with quiet_colmap(0):
-        same, models, apart = join_models(video, parts, short)
+        same, models, apart = join_models(video, parts)
     assert same is video
     assert [part.frames for part in models] == [list(range(HALF)), list(range(HALF, LONG))]
     matrix = np.array(apart[HALF - 1].similarity)

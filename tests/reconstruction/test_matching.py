@@ -105,7 +105,7 @@ def test_the_middle_of_a_video_is_matched_too(count):
     matches = {pair: np.zeros((0, 2), np.uint32) for pair in pairs}
     keypoints = tuple(image_features.keypoints for image_features in features)
     whole = MatchedVideo(tuple(map(Path, names)), names, ((8, 8),) * count, keypoints, (np.zeros(0),) * count, matches)
-    part = whole.search_part(24)
+    part = whole.search_part()
     assert len(part.images) == len(part.keypoints) == 24
     steps = {second - first for first, second in part.matches}
     assert {1, 2, 4} <= steps

@@ -8,7 +8,7 @@ at the lens resolves it: nearer points are brighter.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
@@ -16,12 +16,11 @@ import numpy as np
 from jaxtyping import Float
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.jobs import Progress
+from coliags_plugin.core.jobs import with_progress
 from coliags_plugin.reconstruction.structure.adjustment import adjust, held_out_error
 from coliags_plugin.reconstruction.structure.atlas import Again, held_part, part_of
 from coliags_plugin.reconstruction.structure.mapping import brightness_correlation, bundle_adjust, depths_of
 from coliags_plugin.reconstruction.structure.sfm_settings import (
-    SfmSettings,
     Start,
     candidate_cameras,
     distortion,
@@ -197,33 +196,20 @@ def both_signs(model: pycolmap.Reconstruction, video: MatchedVideo, refined: boo
 
 
 #: Adds cameras to those that were tried; returns the best of all, and the focal lengths, pixels, that fit as well.
-_Trial = Callable[[Iterable[Start]], tuple[Start, Sequence[float]]]
+_Trial = Callable[[Sequence[Start]], tuple[Start, Sequence[float]]]
 
 
-def find_camera(
-    video: MatchedVideo,
-    settings: SfmSettings,
-    models: Sequence[pycolmap.Reconstruction] = (),
-    progress: Progress | None = None,
-) -> Start:
+def find_camera(video: MatchedVideo, models: Sequence[pycolmap.Reconstruction] = ()) -> Start:
     """Estimate the camera model and focal length of a video, from its features or from ``models`` of its tracks.
 
     First lenses of one focal length are tried, then the other focal lengths with the best lens.
     """
-    lenses, factors = candidate_cameras(settings.camera, bool(video.tracks))
-    starts = iter(range(1, count := len(lenses) + len(factors)))
-
-    def announced(cameras: Sequence[Start]) -> Iterator[Start]:
-        for camera in cameras:
-            if progress is not None:
-                progress("try cameras", next(starts), count - 1)
-            yield camera
-
-    if count == 2:
+    lenses, factors = candidate_cameras(video.settings.camera, bool(video.tracks))
+    if len(lenses) == len(factors) == 1:
         return lenses[0]
-    trial = _trial_on_tracks(models, video, settings) if video.tracks else _trial_on_features(video, settings)
-    best, _ = trial(announced(lenses))
-    best, lengths = trial(announced([replace(best, focal_factor=factor) for factor in factors[1:]]))
+    trial = _trial_on_tracks(models, video) if video.tracks else _trial_on_features(video)
+    best, _ = trial(lenses)
+    best, lengths = trial([replace(best, focal_factor=factor) for factor in factors[1:]])
     if max(lengths) > _OTHER_FOCAL_LENGTH * min(lengths):
         log.warning(
             "the images hardly determine the focal length (%.0f to %.0f px fit as well), and a wrong one distorts path "
@@ -233,26 +219,26 @@ def find_camera(
     return best
 
 
-def _trial_on_features(video: MatchedVideo, settings: SfmSettings) -> _Trial:
+def _trial_on_features(video: MatchedVideo) -> _Trial:
     """Make the trial of cameras on features: the middle of the video is mapped with each, and :func:`choose` decides.
 
     Where no model is plausible, the first camera is the best.
     """
-    part, is_camera_refined = video.search_part(settings.search_images), is_refined(settings.camera)
+    part, settings = video.search_part(), video.settings.camera
     hypotheses: list[Hypothesis] = []
     tried: list[Start] = []
 
-    def trial(cameras: Iterable[Start]) -> tuple[Start, Sequence[float]]:
-        for camera in cameras:
+    def trial(cameras: Sequence[Start]) -> tuple[Start, Sequence[float]]:
+        for camera in with_progress(cameras, "try cameras", video.progress):
             tried.append(camera)
-            for model in part.mapped(settings, camera, None)[:1]:
-                hypotheses.extend(both_signs(model, part, is_camera_refined))
+            for model in part.mapped(camera)[:1]:
+                hypotheses.extend(both_signs(model, part, is_refined(settings)))
         try:
-            chosen = choose(hypotheses, settings.camera.field_of_view)
+            chosen = choose(hypotheses, settings.field_of_view)
         except InputError:
             return tried[0], [1.0]
         side = max(part.sizes[0])
-        lengths = fitting_focal_lengths(hypotheses, chosen, settings.camera.field_of_view)
+        lengths = fitting_focal_lengths(hypotheses, chosen, settings.field_of_view)
         return Start(chosen.camera.model_name, chosen.camera.mean_focal_length() / side), lengths
 
     return trial
@@ -266,15 +252,15 @@ _TRIED_MODELS, _FEWEST_TRIED, _SAME_TEST = 3, 12, 1.02
 _MOVED = 0.0015
 
 
-def _trial_on_tracks(models: Sequence[pycolmap.Reconstruction], video: MatchedVideo, settings: SfmSettings) -> _Trial:
+def _trial_on_tracks(models: Sequence[pycolmap.Reconstruction], video: MatchedVideo) -> _Trial:
     """Make the trial of cameras on tracks, by held-out ones in the middle of the largest models; ties: the first."""
     large = [model for model in models[:_TRIED_MODELS] if model.num_reg_images() >= _FEWEST_TRIED] or models[:1]
-    parts = [_middle_of(model, video, settings.search_images) for model in large]
+    parts = [_middle_of(model, video) for model in large]
     errors: dict[Start, float] = {}
 
-    def trial(cameras: Iterable[Start]) -> tuple[Start, Sequence[float]]:
-        for camera in cameras:
-            errors[camera] = _test_error(parts, video, settings, camera)
+    def trial(cameras: Sequence[Start]) -> tuple[Start, Sequence[float]]:
+        for camera in with_progress(cameras, "try cameras", video.progress):
+            errors[camera] = _test_error(parts, video, camera)
             shape = "" if camera.radial is None else f", distortion {camera.radial:g}"
             log.info(
                 "%s, focal length %.2f of the larger side%s: error of held-out tracks %.3f px",
@@ -286,8 +272,9 @@ def _trial_on_tracks(models: Sequence[pycolmap.Reconstruction], video: MatchedVi
     return trial
 
 
-def _middle_of(model: pycolmap.Reconstruction, video: MatchedVideo, count: int) -> pycolmap.Reconstruction:
-    """Part of a model: at most ``count`` images around its middle, of those before which the camera has moved."""
+def _middle_of(model: pycolmap.Reconstruction, video: MatchedVideo) -> pycolmap.Reconstruction:
+    """Part of a model: a few images around its middle, of those before which the camera has moved."""
+    count = video.settings.search_images
     every = [number - 1 for number in sorted(model.reg_image_ids())]
     frames = [frame for frame in every if video.tracks[frame].shift >= _MOVED]
     frames = frames if len(frames) >= _FEWEST_TRIED else every
@@ -295,25 +282,23 @@ def _middle_of(model: pycolmap.Reconstruction, video: MatchedVideo, count: int) 
     return part_of(model, frames[first : first + count])
 
 
-def _test_error(
-    parts: Sequence[pycolmap.Reconstruction], video: MatchedVideo, settings: SfmSettings, start: Start
-) -> float:
+def _test_error(parts: Sequence[pycolmap.Reconstruction], video: MatchedVideo, start: Start) -> float:
     """Geometric mean over models of the held-out error with a camera, pixels; infinite if unknown."""
     import pycolmap
 
     errors = []
     for part in parts:
         tried = pycolmap.Reconstruction(part)
-        with_camera(tried, video, settings, start)
+        with_camera(tried, video, start)
         adjust(tried, video.track_ids)
         errors.append(held_out_error(tried, video.tracks, 0.0))
     measured = [error for error in errors if error is not None]
     return float(np.exp(np.mean(np.log(measured)))) if measured else np.inf
 
 
-def with_camera(model: pycolmap.Reconstruction, video: MatchedVideo, settings: SfmSettings, start: Start) -> None:
+def with_camera(model: pycolmap.Reconstruction, video: MatchedVideo, start: Start) -> None:
     """Set the parameters of the model's camera, in place; the images have one size."""
-    (camera,) = starting_cameras(settings.camera, video.images, video.sizes, start)
+    (camera,) = starting_cameras(video.settings.camera, video.images, video.sizes, start)
     for mine in model.cameras.values():
         mine.params = camera.params
 

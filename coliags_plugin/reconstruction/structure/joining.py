@@ -19,15 +19,14 @@ from jaxtyping import Float, Float32, Int64
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from coliags_plugin.core.jobs import Progress, with_progress
+from coliags_plugin.core.jobs import with_progress
 from coliags_plugin.geometry.poses.alignment import Similarity
 from coliags_plugin.reconstruction.structure.adjustment import Rays, held_out_error, median_of_points, rigid_frames
 from coliags_plugin.reconstruction.structure.atlas import Again, link_at, weak_links
 from coliags_plugin.reconstruction.structure.hypotheses import Hypothesis, adjusted
-from coliags_plugin.reconstruction.structure.image_files import Masks, mask_of, read_image
+from coliags_plugin.reconstruction.structure.image_files import mask_of, read_image
 from coliags_plugin.reconstruction.structure.mapping import brightness_at
 from coliags_plugin.reconstruction.structure.point_tracks import PointFinder, View
-from coliags_plugin.reconstruction.structure.sfm_settings import SfmSettings
 from coliags_plugin.reconstruction.structure.video import MatchedVideo
 
 log = logging.getLogger(__name__)
@@ -54,11 +53,7 @@ _WORSE, _MORE, _MOST_LOST = 1.05, 0.1, 0.02
 
 
 def join_models(
-    video: MatchedVideo,
-    models: Sequence[Hypothesis],
-    settings: SfmSettings,
-    masks: Masks = None,
-    progress: Progress | None = None,
+    video: MatchedVideo, models: Sequence[Hypothesis]
 ) -> tuple[MatchedVideo, list[Hypothesis], dict[int, Again]]:
     """Join models of tracks that show the same wall.
 
@@ -66,7 +61,7 @@ def join_models(
     hardly farther off than in its parts, nearer points are brighter, and its sides hold together. Returns the video
     with the points found again, the models, and joins that were found but not made.
     """
-    compare = _Comparison(video, settings, masks)
+    compare = _Comparison(video)
     parts = list(models)
     unjoined: list[tuple[range, range]] = []
     cuts = {link.after for model in models for link in weak_links(model.model)}
@@ -75,7 +70,7 @@ def join_models(
         for stretch in stretches_of([part.frames for part in parts if len(part.frames) >= _LEAST_FRAMES], cuts)
         if len(stretch) >= _FRAMES
     ]
-    for number, earlier in enumerate(with_progress(stretches, "join models", progress)):
+    for number, earlier in enumerate(with_progress(stretches, "join models", video.progress)):
         for later in stretches[number + 1 : number + 1 + _AHEAD]:
             first, second = (next(part for part in parts if side[0] in part.frames) for side in (earlier, later))
             if first is second:
@@ -84,7 +79,7 @@ def join_models(
             if not sightings:
                 continue
             extended, joined = _with_sightings(video, sightings), None
-            if len(first.frames) + len(second.frames) <= settings.tracks.longest_window:
+            if len(first.frames) + len(second.frames) <= video.settings.tracks.longest_window:
                 joined = _joined(extended, first, second, sightings, earlier[-1], later[0])
             log.info(
                 "frames %d and %d show the same wall: %d comparisons of frames agree; %s",
@@ -145,13 +140,13 @@ class _Sighting:
 
 
 class _Comparison:
-    def __init__(self, video: MatchedVideo, settings: SfmSettings, masks: Masks) -> None:
-        self.video, self.seed = video, settings.seed
-        self.finder = PointFinder(settings.tracks)
+    def __init__(self, video: MatchedVideo) -> None:
+        self.video = video
+        self.finder = PointFinder(video.settings.tracks)
 
         @lru_cache(maxsize=2 * _FRAMES * (_AHEAD + 1))
         def view(frame: int) -> View:
-            return self.finder.view(read_image(video.images[frame]), mask_of(video.images[frame], masks))
+            return self.finder.view(read_image(video.images[frame]), mask_of(video.images[frame], video.masks))
 
         self.view = view
 
@@ -201,7 +196,8 @@ class _Comparison:
         if len(rows) < _FEWEST_FOUND:
             return None
         options = pycolmap.AbsolutePoseEstimationOptions()
-        options.ransac.max_error, options.ransac.random_seed = _POSE_ERROR * float(target.view.stretch.max()), self.seed
+        options.ransac.max_error = _POSE_ERROR * float(target.view.stretch.max())
+        options.ransac.random_seed = self.video.settings.seed
         options.ransac.min_num_trials, options.ransac.max_num_trials = _TRIALS
         pixels, points = target.view.in_image(moved), source.points[rows]
         matches = pixels.astype(np.float64), points, seen_by.camera

@@ -137,7 +137,7 @@ def reconstruct(
         raise InputError(f"{len(images) or 'no'} image", "at least two", "Give more of the video")
     with quiet_colmap(settings.seed):
         video = read_video(images, settings, masks, progress)
-        atlas = _atlas(video, _models(video, settings, progress), settings, masks, progress)
+        atlas = _atlas(video, _models(video))
         if not atlas.models:
             counts = [len(keypoints) for keypoints in video.keypoints]
             matches = [len(pairs) for pairs in video.matches.values()] or [0]
@@ -152,26 +152,25 @@ def reconstruct(
         return atlas
 
 
-def _models(video: MatchedVideo, settings: SfmSettings, progress: Progress | None) -> list[Hypothesis]:
+def _models(video: MatchedVideo) -> list[Hypothesis]:
     """Models of a video with one camera per image size, adjusted, the largest first."""
-    start = candidate_cameras(settings.camera, tracked=True)[0][0]
-    if not video.tracks:
-        start = find_camera(video, settings, progress=progress)
-    models = video.mapped(settings, start, progress)
+    settings = video.settings.camera
+    start = candidate_cameras(settings, tracked=True)[0][0] if video.tracks else find_camera(video)
+    models = video.mapped(start)
     if not models:
         return []
     if video.tracks:
-        start = find_camera(video, settings, models, progress)
+        start = find_camera(video, models)
         for model in models:
-            with_camera(model, video, settings, start)
-        if settings.camera.refine:
+            with_camera(model, video, start)
+        if settings.refine:
             bundle_adjust(models[0], refine_camera=True)
             for model in models[1:]:
                 _take_cameras(model, models[0])
-        return [adjusted(model, video) for model in with_progress(models, "adjust models", progress)]
-    refined = is_refined(settings.camera)
-    is_fixed = has_known_camera(settings.camera) and not refined
-    largest = choose(both_signs(models[0], video, refined), (0.0, 180.0) if is_fixed else settings.camera.field_of_view)
+        return [adjusted(model, video) for model in with_progress(models, "adjust models", video.progress)]
+    refined = is_refined(settings)
+    is_fixed = has_known_camera(settings) and not refined
+    largest = choose(both_signs(models[0], video, refined), (0.0, 180.0) if is_fixed else settings.field_of_view)
     hypotheses = [largest]
     for model in models[1:]:
         has_its_cameras = set(model.cameras) <= set(largest.model.cameras)
@@ -197,34 +196,29 @@ _SHORT, _WORSE, _LEAST_FINENESS = 12, 2.0, 1.6
 _LEAST_EXTENT = 0.25
 
 
-def _atlas(
-    video: MatchedVideo,
-    chosen: Sequence[Hypothesis],
-    settings: SfmSettings,
-    masks: Masks = None,
-    progress: Progress | None = None,
-) -> Atlas:
+def _atlas(video: MatchedVideo, chosen: Sequence[Hypothesis]) -> Atlas:
     """The models, those of tracks split where their sides do not hold together, and joined where they show the same."""
+    fewest = video.settings.min_model_size
     hypotheses: list[Hypothesis] = []
     refused: list[Link] = []
     for hypothesis in chosen:
         broken: list[Link] = []
         if video.tracks:
             weak = [link for link in weak_links(hypothesis.model) if not link.holds]
-            broken = _apart([*weak, *contradictions(hypothesis.model, weak)], settings.min_model_size)
+            broken = _apart([*weak, *contradictions(hypothesis.model, weak)], fewest)
         refused += broken
         frames = np.array(hypothesis.frames)
         for part in np.split(frames, np.searchsorted(frames, [link.after for link in broken], side="right")):
             piece = hypothesis
-            if broken and len(part) >= settings.min_model_size:
+            if broken and len(part) >= fewest:
                 piece = adjusted(part_of(hypothesis.model, part.tolist()), video)
-            if min(piece.images, len(part)) >= settings.min_model_size:
+            if min(piece.images, len(part)) >= fewest:
                 pieces, moving = _rigid_stretches(piece, video)
                 hypotheses += pieces
                 refused += moving
     apart: dict[int, Again] = {}
     if video.tracks:
-        video, hypotheses, apart = join_models(video, hypotheses, settings, masks, progress)
+        video, hypotheses, apart = join_models(video, hypotheses)
     joined_again = {after for hypothesis in hypotheses for after in hypothesis.joins}
     refused = [link for link in refused if link.after not in joined_again]
     models = [_result(video, model) for model in hypotheses]

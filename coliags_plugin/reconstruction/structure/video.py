@@ -6,7 +6,7 @@ import logging
 import shutil
 import tempfile
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cache
 from operator import itemgetter
 from pathlib import Path
@@ -58,12 +58,16 @@ class MatchedVideo:
     tracks: tuple[FramePoints, ...] = ()  # of each image, where matches are of tracks
     track_ids: tuple[Int64[np.ndarray, "K"], ...] = ()  # of the keypoints, where matches are of tracks
     picture: Picture | None = None  # that sizes, keypoints and tracks are of; None: whole images
+    settings: SfmSettings = field(default_factory=SfmSettings)
+    masks: Masks = None
+    progress: Progress | None = None
 
-    def search_part(self, count: int) -> MatchedVideo:
-        """At most ``count`` images around the middle, on which cameras are tried.
+    def search_part(self) -> MatchedVideo:
+        """A few images around the middle, on which cameras are tried.
 
         Every second or fourth, if there are enough: these are matched like all (:func:`alike_pairs`).
         """
+        count = self.settings.search_images
         step = next((step for step in (4, 2) if len(self.images) >= step * count), 1)
         first = max(0, (len(self.images) - (count - 1) * step - 1) // 2)
         chosen = list(range(first, len(self.images), step))[:count]
@@ -74,33 +78,59 @@ class MatchedVideo:
             for (first_image, second_image), pairs in self.matches.items()
             if first_image in row_of and second_image in row_of
         }
-        return MatchedVideo(
-            pick(self.images), pick(self.names), pick(self.sizes), pick(self.keypoints), pick(self.brightness), matches
-        )
+        picked = {name: pick(getattr(self, name)) for name in ("images", "names", "sizes", "keypoints", "brightness")}
+        return replace(self, **picked, matches=matches, progress=None)
 
-    def mapped(self, settings: SfmSettings, start: Start, progress: Progress | None) -> list[pycolmap.Reconstruction]:
+    def mapped(self, start: Start) -> list[pycolmap.Reconstruction]:
         """Models by mapping with fixed intrinsics, the largest first."""
-        cameras = starting_cameras(settings.camera, self.images, self.sizes, start)
-        kinds = list(dict.fromkeys(self.sizes))
-        named = [(name, kinds.index(size)) for name, size in zip(self.names, self.sizes, strict=True)]
         models = []
         with tempfile.TemporaryDirectory() as scratch:
             database, folder = Path(scratch) / "database.db", Path(scratch) / "models"
             if not self.tracks:
-                write_database(database, cameras, named, self.keypoints, self.matches)
-                return map_images(database, folder, settings, len(self.images), progress)
-            windows = cut_where_lost([frame.followed for frame in self.tracks], settings.tracks.longest_window)
+                self._write_database(database, start, range(len(self.images)))
+                return map_images(database, folder, self.settings, len(self.images), self.progress)
+            followed = [frame.followed for frame in self.tracks]
+            windows = cut_where_lost(followed, self.settings.tracks.longest_window)
             if len(windows) > 1:
                 cuts = ", ".join(str(window.start) for window in windows[1:])
                 log.info("the video is mapped in %d windows, cut before frames %s", len(windows), cuts)
-            for window in with_progress(windows, "find poses", progress if len(windows) > 1 else None):
-                frames = slice(window.start, window.stop)
-                inside = {(i, j): pairs for (i, j), pairs in self.matches.items() if i in window and j in window}
-                write_database(database, cameras, named[frames], self.keypoints[frames], inside, window.start)
-                models += map_tracks(database, folder, settings)
+            for window in with_progress(windows, "find poses", self.progress if len(windows) > 1 else None):
+                self._write_database(database, start, window)
+                models += map_tracks(database, folder, self.settings)
                 database.unlink()
                 shutil.rmtree(folder)
         return sorted(models, key=lambda model: -model.num_reg_images())
+
+    def _write_database(self, path: Path, start: Start, frames: range) -> None:
+        """Create a database of some frames, whose matches COLMAP has to verify.
+
+        Image i gets COLMAP's image and frame ID i + 1, the camera of the k-th image size camera and rig ID k + 1.
+        """
+        import pycolmap
+
+        cameras = starting_cameras(self.settings.camera, self.images, self.sizes, start)
+        camera_ids = {size: number for number, size in enumerate(dict.fromkeys(self.sizes), start=1)}
+        database = pycolmap.Database.open(str(path))
+        try:
+            for number, camera in enumerate(cameras, start=1):
+                camera.camera_id = number
+                database.write_camera(camera, use_camera_id=True)
+                rig = pycolmap.Rig(rig_id=number)
+                rig.add_ref_sensor(camera.sensor_id)
+                database.write_rig(rig, use_rig_id=True)
+            for index in frames:
+                camera_id = camera_ids[self.sizes[index]]
+                image = pycolmap.Image(name=self.names[index], camera_id=camera_id, image_id=index + 1)
+                database.write_image(image, use_image_id=True)
+                frame = pycolmap.Frame(frame_id=index + 1, rig_id=camera_id)
+                frame.add_data_id(image.data_id)
+                database.write_frame(frame, use_frame_id=True)
+                database.write_keypoints(index + 1, np.ascontiguousarray(self.keypoints[index]))
+            for (first, second), pairs in self.matches.items():
+                if first in frames and second in frames and len(pairs):
+                    database.write_matches(first + 1, second + 1, np.ascontiguousarray(pairs, np.uint32))
+        finally:
+            database.close()
 
 
 def cut_where_lost(followed: Sequence[float], longest: int) -> list[range]:
@@ -141,18 +171,29 @@ def read_video(
         features = extract(image, mask_of(images[index], masks))
         return features, brightness_at(image, features.pixels)
 
+    video: MatchedVideo | None = None
     some = _sharpest(images, settings)
     if _needs_tracks([sizes[index] for index in some], some, settings, features_of):
         features_of.cache_clear()
         points = track_points(images, settings.tracks, masks, progress)
         if settings.matching == "tracks" or np.median([frame.followed for frame in points]) >= _FOLLOWED:
-            return _in_picture(_tracked(images, sizes, points), picture)
-        log.info("points cannot be followed from image to image: features are matched instead")
-    if len(some) < len(images):
-        log.info("features of %d of %d images are matched", len(some), len(images))
-    sharp_images, sharp_sizes = tuple(images[index] for index in some), tuple(sizes[index] for index in some)
-    video = _with_features(sharp_images, sharp_sizes, settings, lambda row: features_of(some[row]), progress)
-    return _in_picture(video, picture)
+            video = _tracked(images, sizes, points)
+        else:
+            log.info("points cannot be followed from image to image: features are matched instead")
+    if video is None:
+        if len(some) < len(images):
+            log.info("features of %d of %d images are matched", len(some), len(images))
+        sharp_images, sharp_sizes = tuple(images[index] for index in some), tuple(sizes[index] for index in some)
+        video = _with_features(sharp_images, sharp_sizes, settings, lambda row: features_of(some[row]), progress)
+    if picture is not None:  # of one size: keypoints are those of the picture
+        corner = np.array(picture.corner, np.float32)
+        video = replace(
+            video,
+            sizes=(picture.size,) * len(video.images),
+            keypoints=tuple(np.hstack([points[:, :2] - corner, points[:, 2:]]) for points in video.keypoints),
+            tracks=tuple(replace(frame, pixels=frame.pixels - corner) for frame in video.tracks),
+        )
+    return replace(video, picture=picture, settings=settings, masks=masks, progress=progress)
 
 
 def _sharpest(images: Sequence[Path], settings: SfmSettings) -> list[int]:
@@ -164,17 +205,6 @@ def _sharpest(images: Sequence[Path], settings: SfmSettings) -> list[int]:
         return list(range(len(images)))
     values = [sharpness(cv2.cvtColor(read_image(path), cv2.COLOR_RGB2GRAY)) for path in images]
     return [first + int(np.argmax(values[first : first + step])) for first in range(0, len(images), step)]
-
-
-def _in_picture(video: MatchedVideo, picture: Picture | None) -> MatchedVideo:
-    """The video in pixels of a part of its images, which have one size."""
-    if picture is None:
-        return video
-    corner = np.array(picture.corner, np.float32)
-    tracks = tuple(replace(frame, pixels=frame.pixels - corner) for frame in video.tracks)
-    keypoints = tuple(np.concatenate([points[:, :2] - corner, points[:, 2:]], axis=1) for points in video.keypoints)
-    sizes = (picture.size,) * len(video.images)
-    return replace(video, keypoints=keypoints, sizes=sizes, tracks=tracks, picture=picture)
 
 
 #: Features of an image by its index, and the brightness at them.
@@ -286,40 +316,3 @@ def _tracked(
     keypoints = tuple(frame.pixels[rows] for frame, rows in zip(points, used, strict=True))
     brightness = tuple(frame.brightness[rows].astype(np.float64) for frame, rows in zip(points, used, strict=True))
     return MatchedVideo(images, _named(images), sizes, keypoints, brightness, matches, tuple(points), tuple(ids))
-
-
-def write_database(
-    path: Path,
-    cameras: Sequence[pycolmap.Camera],
-    images: Sequence[tuple[str, int]],
-    keypoints: Sequence[Float32[np.ndarray, "K D"]],
-    matches: Matches,
-    first_index: int = 0,
-) -> None:
-    """Create a database; image i gets COLMAP's image and frame ID i + 1, camera k its camera and rig ID k + 1.
-
-    Images are counted from ``first_index``, those of the matches too. COLMAP has to verify the matches.
-    """
-    import pycolmap
-
-    database = pycolmap.Database.open(str(path))
-    try:
-        for number, camera in enumerate(cameras, start=1):
-            camera.camera_id = number
-            database.write_camera(camera, use_camera_id=True)
-            rig = pycolmap.Rig(rig_id=number)
-            rig.add_ref_sensor(camera.sensor_id)
-            database.write_rig(rig, use_rig_id=True)
-        numbered = enumerate(zip(images, keypoints, strict=True), start=first_index + 1)
-        for number, ((name, camera_index), image_keypoints) in numbered:
-            image = pycolmap.Image(name=name, camera_id=camera_index + 1, image_id=number)
-            database.write_image(image, use_image_id=True)
-            frame = pycolmap.Frame(frame_id=number, rig_id=camera_index + 1)
-            frame.add_data_id(image.data_id)
-            database.write_frame(frame, use_frame_id=True)
-            database.write_keypoints(number, np.ascontiguousarray(image_keypoints))
-        for (first, second), pairs in matches.items():
-            if len(pairs):
-                database.write_matches(first + 1, second + 1, np.ascontiguousarray(pairs, np.uint32))
-    finally:
-        database.close()
