@@ -46,12 +46,7 @@ class Rays:
     directions: Float[np.ndarray, "K 3"]  # world, unit length
 
     @classmethod
-    def of(
-        cls,
-        model: pycolmap.Reconstruction,
-        ids: Sequence[Int64[np.ndarray, "P"]],
-        pixels: Sequence[Any],
-    ) -> Rays:
+    def of(cls, model: pycolmap.Reconstruction, ids: Sequence[Int64[np.ndarray, "P"]], pixels: Sequence[Any]) -> Rays:
         """Observations in the frames of the model; image i has ID i + 1, and its tracks and pixels are given at i."""
         parts = []
         for number in sorted(model.reg_image_ids()):

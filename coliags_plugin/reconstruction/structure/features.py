@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, UInt8, UInt32
+from jaxtyping import Bool, Float, Float32, UInt32
 from scipy.sparse import coo_array
 from scipy.spatial import cKDTree
 
@@ -18,6 +18,7 @@ from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.core.jobs import Progress, with_progress
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.geometry.lenses.models import PinholeLens
+from coliags_plugin.reconstruction.structure.image_files import Image, Mask
 from coliags_plugin.reconstruction.structure.sfm_settings import FeatureSettings, SfmSettings
 
 
@@ -38,7 +39,7 @@ class Features:
         return len(self.keypoints)
 
 
-def image_and_mask(frame: Frame) -> tuple[UInt8[np.ndarray, "H W 3"], Bool[np.ndarray, "H W"] | None]:
+def image_and_mask(frame: Frame) -> tuple[Image, Mask | None]:
     """A frame's RGB image and its mask, if any."""
     return frame.image.cpu().numpy(), None if frame.mask is None else frame.mask.cpu().numpy()
 
@@ -46,7 +47,7 @@ def image_and_mask(frame: Frame) -> tuple[UInt8[np.ndarray, "H W 3"], Bool[np.nd
 #: Clip limit of the local contrast enhancement (CLAHE) of the grey image, on 8 x 8 tiles.
 _CLIP_LIMIT = 4.0
 #: Extracts the features of an RGB image where its mask, if any, is True.
-Extractor = Callable[[UInt8[np.ndarray, "H W 3"], Bool[np.ndarray, "H W"] | None], Features]
+Extractor = Callable[[Image, Mask | None], Features]
 
 
 def feature_extractor(settings: FeatureSettings) -> Extractor:
@@ -80,9 +81,7 @@ def feature_extractor(settings: FeatureSettings) -> Extractor:
     return extract
 
 
-def usable(
-    image: UInt8[np.ndarray, "H W 3"], mask: Bool[np.ndarray, "H W"] | None, settings: FeatureSettings
-) -> Bool[np.ndarray, "H W"]:
+def usable(image: Image, mask: Mask | None, settings: FeatureSettings) -> Mask:
     """Pixels where features are accepted: neither masked nor near a highlight."""
     excluded = highlights(image, settings)
     if mask is not None:
@@ -90,7 +89,7 @@ def usable(
     return ~dilated(excluded, settings.margin)
 
 
-def highlights(image: UInt8[np.ndarray, "H W 3"], settings: FeatureSettings) -> Bool[np.ndarray, "H W"]:
+def highlights(image: Image, settings: FeatureSettings) -> Mask:
     """Specular highlights: pixels that are saturated or much brighter than their surroundings."""
     import cv2
 

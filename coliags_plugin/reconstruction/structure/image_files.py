@@ -21,8 +21,11 @@ log = logging.getLogger(__name__)
 #: Suffixes of images of other programs, which are not read.
 _UNREAD = (".avif", ".dng", ".exr", ".gif", ".heic", ".heif", ".jp2", ".jxl", ".ppm")
 
+#: An RGB image, and where its pixels count.
+Image = UInt8[np.ndarray, "H W 3"]
+Mask = Bool[np.ndarray, "H W"]
 #: False where a pixel is ignored: one for all images, or one per image; None where none is.
-Masks = Mapping[Path, Bool[np.ndarray, "H W"]] | Bool[np.ndarray, "H W"] | None
+Masks = Mapping[Path, Mask] | Mask | None
 
 _FFMPEG = "make images with ffmpeg -i VIDEO -vf fps=10 FOLDER/%05d.png"
 
@@ -50,7 +53,7 @@ def _warn_of_unread(folder: Path, count: int, example: str) -> None:
     log.warning("%s: %d images are not read, as %s: convert them", folder, count, example)
 
 
-def read_image(path: Path) -> UInt8[np.ndarray, "H W 3"]:
+def read_image(path: Path) -> Image:
     """Read an image as 8-bit RGB, converting other formats."""
     return np.ascontiguousarray(read_8_bit(path)[..., :3])
 
@@ -60,7 +63,7 @@ def read_image(path: Path) -> UInt8[np.ndarray, "H W 3"]:
 _SAME = 0.4
 
 
-def is_repeated(before: UInt8[np.ndarray, "H W 3"], after: UInt8[np.ndarray, "H W 3"]) -> bool:
+def is_repeated(before: Image, after: Image) -> bool:
     """True if an image shows the same as the one before, as in videos converted to a higher frame rate."""
     import cv2
 
@@ -87,7 +90,7 @@ def masks_for(path: Path, images: Sequence[Path]) -> Masks:
     return masks
 
 
-def mask_of(image: Path, masks: Masks) -> Bool[np.ndarray, "H W"] | None:
+def mask_of(image: Path, masks: Masks) -> Mask | None:
     """The mask of an image, with that of its alpha channel."""
     mask, shown = masks.get(image) if isinstance(masks, Mapping) else masks, None
     if has_alpha(image):

@@ -18,10 +18,13 @@ from jaxtyping import Bool, Float, Float32, Int64, UInt8
 from coliags_plugin.core.arrays import dilated
 from coliags_plugin.core.jobs import Progress, with_progress
 from coliags_plugin.reconstruction.structure.features import epipolar_inliers, highlights
-from coliags_plugin.reconstruction.structure.image_files import Masks, mask_of, read_image
+from coliags_plugin.reconstruction.structure.image_files import Image, Mask, Masks, mask_of, read_image
 from coliags_plugin.reconstruction.structure.mapping import brightness_at
 from coliags_plugin.reconstruction.structure.sfm_settings import FeatureSettings, TrackSettings
 
+#: A grey image, and points in an image: columns and rows.
+Gray = UInt8[np.ndarray, "h w"]
+Pixels = Float32[np.ndarray, "K 2"]
 #: Brightness, of 255, that is added before the logarithm, so that noise in the dark is not amplified without bound.
 _DARK_OFFSET = 4.0
 #: Standard deviations of the local mean, for detail and for folds, of the highlights' fill, of the denoising, pixels.
@@ -42,9 +45,7 @@ _COARSE_MARGIN = 12
 _MARGIN, _EDGE = 2, 4
 
 
-def wall_textures(
-    image: UInt8[np.ndarray, "H W 3"], mask: Bool[np.ndarray, "H W"] | None = None
-) -> tuple[UInt8[np.ndarray, "H W"], UInt8[np.ndarray, "H W"], Bool[np.ndarray, "H W"]]:
+def wall_textures(image: Image, mask: Mask | None = None) -> tuple[Gray, Gray, Mask]:
     """Log brightness of an RGB image, normalised over short and over longer distances, and where it is of use.
 
     The first shows vessels and grain, to be located exactly; the second also folds, which tell large displacements.
@@ -66,9 +67,7 @@ def wall_textures(
     return detail, _normalised(log, _FOLDS)[0], usable
 
 
-def _normalised(
-    log: Float32[np.ndarray, "H W"], reach: float
-) -> tuple[UInt8[np.ndarray, "H W"], Float32[np.ndarray, "H W"]]:
+def _normalised(log: Float32[np.ndarray, "H W"], reach: float) -> tuple[Gray, Float32[np.ndarray, "H W"]]:
     """Difference from the local mean in units of the local standard deviation, as grey levels; and that deviation."""
     import cv2
 
@@ -78,12 +77,7 @@ def _normalised(
     return texture, deviation
 
 
-def correlation_at(
-    first: UInt8[np.ndarray, "H W"],
-    second: UInt8[np.ndarray, "H W"],
-    pixels: Float32[np.ndarray, "K 2"],
-    moved: Float32[np.ndarray, "K 2"],
-) -> Float32[np.ndarray, "K"]:
+def correlation_at(first: Gray, second: Gray, pixels: Pixels, moved: Pixels) -> Float32[np.ndarray, "K"]:
     """Normalised cross-correlation of 11 x 11 pixels around pixels of one texture and around those of another. [K]
 
     ``moved`` are ``pixels``, columns and rows with pixel centres at integers, as the second texture shows them.
@@ -94,7 +88,7 @@ def correlation_at(
     return np.asarray((centred * partners).sum(axis=1) / np.maximum(power, 1e-3))
 
 
-def sharpness(gray: UInt8[np.ndarray, "h w"]) -> float:
+def sharpness(gray: Gray) -> float:
     """Root mean square of the Laplacian of the smoothed image, relative to its mean brightness; 0 for a black image.
 
     Highlights do not count: they are sharp in a blurred frame too. Comparable between frames of one video only.
@@ -109,7 +103,7 @@ def sharpness(gray: UInt8[np.ndarray, "h w"]) -> float:
     return float(np.sqrt(np.mean(np.square(edges[counted])))) / brightness
 
 
-def fineness(gray: UInt8[np.ndarray, "h w"]) -> float:
+def fineness(gray: Gray) -> float:
     """Fine detail relative to coarse: root mean square Laplacians of log brightness, smoothed by 2 px and by 4 px.
 
     2 to 3.5 where an image is sharp; at a blur of 3 px 1.7, of 6 px 1.2; infinity without coarse detail. It does not
@@ -157,7 +151,7 @@ class FramePoints:
     """Tracked points of one frame."""
 
     ids: Int64[np.ndarray, "K"]  # numbers of the tracks, ascending
-    pixels: Float32[np.ndarray, "K 2"]  # column and row in the frame, pixel centres at integers + 0.5
+    pixels: Pixels  # column and row in the frame, pixel centres at integers + 0.5
     brightness: Float32[np.ndarray, "K"]  # mean of red, green and blue around them, 0 to 255
     followed: int  # number of points that came from the frame before
     shift: float  # their median displacement, as a share of the larger side
@@ -172,9 +166,7 @@ def shared_tracks(first: FramePoints, second: FramePoints) -> Int64[np.ndarray, 
 
 
 def track_between(
-    images: Sequence[UInt8[np.ndarray, "H W 3"]],
-    masks: Sequence[Bool[np.ndarray, "H W"] | None],
-    settings: TrackSettings | None = None,
+    images: Sequence[Image], masks: Sequence[Mask | None], settings: TrackSettings | None = None
 ) -> tuple[Float[np.ndarray, "K 2"], Float[np.ndarray, "K 2"]]:
     """Track points through consecutive RGB images of one size; their pixels in the first and in the last.
 
@@ -232,21 +224,21 @@ def _around(followed: Sequence[int]) -> list[range]:
 class View:
     """A reduced image prepared for tracking, with points in it (pixel centres at integers)."""
 
-    detail: UInt8[np.ndarray, "h w"]
-    folds: UInt8[np.ndarray, "h w"]
-    usable: Bool[np.ndarray, "h w"]
+    detail: Gray
+    folds: Gray
+    usable: Mask
     ids: Int64[np.ndarray, "K"]
-    pixels: Float32[np.ndarray, "K 2"]
+    pixels: Pixels
     stretch: Float32[np.ndarray, "2"]  # factors from the reduced image to the whole one
     sharpness: float
     fineness: float
     age: int = 0
 
-    def in_image(self, pixels: Float32[np.ndarray, "N 2"]) -> Float32[np.ndarray, "N 2"]:
+    def in_image(self, pixels: Pixels) -> Pixels:
         """Pixels of the view in the whole image, pixel centres at integers + 0.5."""
         return (pixels + 0.5) * self.stretch
 
-    def from_image(self, pixels: Float[np.ndarray, "N 2"]) -> Float32[np.ndarray, "N 2"]:
+    def from_image(self, pixels: Float[np.ndarray, "N 2"]) -> Pixels:
         """Pixels of the whole image, centres at integers + 0.5, in the view."""
         return (pixels / self.stretch - 0.5).astype(np.float32)
 
@@ -254,7 +246,7 @@ class View:
         """The view with some of its points, in the order given."""
         return replace(self, ids=self.ids[rows], pixels=self.pixels[rows])
 
-    def with_points(self, ids: Int64[np.ndarray, "N"], pixels: Float32[np.ndarray, "N 2"]) -> View:
+    def with_points(self, ids: Int64[np.ndarray, "N"], pixels: Pixels) -> View:
         """The view with further points."""
         return replace(self, ids=np.concatenate([self.ids, ids]), pixels=np.concatenate([self.pixels, pixels]))
 
@@ -269,7 +261,7 @@ class PointFinder:
         self.flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
         self.flow.setFinestScale(1)
 
-    def view(self, image: UInt8[np.ndarray, "H W 3"], mask: Bool[np.ndarray, "H W"] | None) -> View:
+    def view(self, image: Image, mask: Mask | None) -> View:
         """Textures of an image, reduced to the side of the settings, without points."""
         import cv2
 
@@ -283,7 +275,7 @@ class PointFinder:
         none = np.empty(0, np.int64), np.empty((0, 2), np.float32)
         return View(*wall_textures(small, mask), *none, stretch, sharpness(gray), fineness(gray))
 
-    def find(self, before: View, after: View) -> tuple[Int64[np.ndarray, "N"], Float32[np.ndarray, "N 2"]]:
+    def find(self, before: View, after: View) -> tuple[Int64[np.ndarray, "N"], Pixels]:
         """Rows and new pixels of the points of one view that another shows, by correlation alone."""
         if not len(before.ids):
             return np.empty(0, np.int64), np.empty((0, 2), np.float32)
@@ -316,7 +308,7 @@ class PointTracker:
         self.bridges: list[View] = []
         self.next_id = first_id
 
-    def advance(self, image: UInt8[np.ndarray, "H W 3"], mask: Bool[np.ndarray, "H W"] | None) -> FramePoints:
+    def advance(self, image: Image, mask: Mask | None) -> FramePoints:
         """Follow the points into the next image, and add corners."""
         view = self.finder.view(image, mask)
         shift = 0.0
@@ -344,7 +336,7 @@ class PointTracker:
         brightness = brightness_at(image, pixels.astype(np.float64)).astype(np.float32)
         return FramePoints(view.ids[order], pixels, brightness, followed, shift, view.sharpness, view.fineness)
 
-    def _followed(self, before: View, after: View) -> tuple[Int64[np.ndarray, "N"], Float32[np.ndarray, "N 2"]]:
+    def _followed(self, before: View, after: View) -> tuple[Int64[np.ndarray, "N"], Pixels]:
         """Rows and new pixels of the points of one view that another shows, with the epipolar check.
 
         All or none: half of those that come back, and 20 at least, have to satisfy one epipolar geometry. Where both
@@ -382,11 +374,11 @@ def _without_collisions(view: View) -> View:
 
 
 def _there_and_back(
-    before: UInt8[np.ndarray, "h w"],
-    after: UInt8[np.ndarray, "h w"],
-    pixels: Float32[np.ndarray, "K 2"],
+    before: Gray,
+    after: Gray,
+    pixels: Pixels,
     flows: tuple[Float32[np.ndarray, "h w 2"], Float32[np.ndarray, "h w 2"]] | None,
-) -> tuple[Float32[np.ndarray, "K 2"], Float32[np.ndarray, "K 2"]]:
+) -> tuple[Pixels, Pixels]:
     """Track points by Lucas-Kanade, from dense flow or coarse to fine, and back again; infinity if lost."""
     import cv2
 
@@ -408,7 +400,7 @@ def _there_and_back(
     return ends[0], np.where(status[:, None], ends[1], np.float32(np.inf))
 
 
-def _sampled(flow: Float32[np.ndarray, "h w 2"], pixels: Float32[np.ndarray, "K 2"]) -> Float32[np.ndarray, "K 2"]:
+def _sampled(flow: Float32[np.ndarray, "h w 2"], pixels: Pixels) -> Pixels:
     import cv2
 
     channels = [cv2.remap(flow[..., k], pixels[:, 0], pixels[:, 1], cv2.INTER_LINEAR).ravel() for k in (0, 1)]
