@@ -44,12 +44,11 @@ class ListCommand:
             **{kind: partial(sources, kind) for kind in REGISTRIES},
         }
         check_name("kind", self.kind, ("all", *texts))
-        kinds = list(texts) if self.kind == "all" else [self.kind]
-        listed = {kind: texts[kind]() for kind in kinds}
-        head, indent = ("{}:", "  ") if self.kind == "all" else ("", "")
+        listed = {kind: texts[kind]() for kind in (texts if self.kind == "all" else [self.kind])}
         lines = []
         for kind, rows in listed.items():
-            lines += [head.format(kind)] if head else []
+            lines += [f"{kind}:"] if self.kind == "all" else []
+            indent = "  " if self.kind == "all" else ""
             lines += [f"{indent}{name:<28}{text}".rstrip() for name, text in rows.items()]
         print_summary("\n".join(lines), listed, as_json=self.json)
 

@@ -15,7 +15,7 @@ from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from runpy import run_path
-from typing import Any, TypeGuard
+from typing import Any
 
 from coliags_plugin.core.errors import InputError, check_name
 
@@ -80,20 +80,17 @@ class Registry:
         check_name(self.noun, name, self.names())
         target = self._targets[name]
         if isinstance(target, str):
-            target = self._targets[name] = self._imported(name, target)
+            try:
+                target = self._targets[name] = _load(target)
+            except (ImportError, AttributeError, ValueError) as error:
+                if self._sources[name] == "built in":
+                    raise
+                raise InputError(
+                    f"{self.noun} '{name}' from {self._sources[name]} cannot be imported: {error}",
+                    "module:Class",
+                    "Correct it, or uninstall the package",
+                ) from error
         return target
-
-    def _imported(self, name: str, target: str) -> Any:
-        try:
-            return _load(target)
-        except (ImportError, AttributeError, ValueError) as error:
-            if self._sources[name] == "built in":
-                raise
-            raise InputError(
-                f"{self.noun} '{name}' from {self._sources[name]} cannot be imported: {error}",
-                "module:Class",
-                "Correct it, or uninstall the package",
-            ) from error
 
     def __iter__(self) -> Iterator[str]:
         return iter(self.names())
@@ -125,14 +122,6 @@ def _load(target: str) -> Any:
     return getattr(import_module(module), attribute)
 
 
-def _is_components(components: object) -> TypeGuard[dict[str, dict[str, object]]]:
-    return (
-        isinstance(components, dict)
-        and set(components) <= set(REGISTRIES)
-        and all(isinstance(named, dict) for named in components.values())
-    )
-
-
 @cache
 def _plugin_files(path_list: str) -> dict[str, dict[str, dict[str, object]]]:
     files: dict[str, dict[str, dict[str, object]]] = {}
@@ -143,8 +132,9 @@ def _plugin_files(path_list: str) -> dict[str, dict[str, dict[str, object]]]:
                 "a path list of Python files",
                 f"Correct or unset {PLUGIN_PATH_VARIABLE}",
             )
-        components = run_path(path).get("COMPONENTS")
-        if not _is_components(components):
+        components: Any = run_path(path).get("COMPONENTS")
+        is_mapping = isinstance(components, dict) and components.keys() <= REGISTRIES.keys()
+        if not is_mapping or not all(isinstance(named, dict) for named in components.values()):
             raise InputError(
                 f"{path} defines COMPONENTS = {components!r}",
                 f"{{kind: {{name: class}}}}, the kinds being {', '.join(REGISTRIES)}",

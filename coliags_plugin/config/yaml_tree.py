@@ -14,7 +14,7 @@ import yaml
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.settings import invalid_reported
-from coliags_plugin.core.text_files import whole_text
+from coliags_plugin.core.text_files import read_text
 
 
 @dataclass(frozen=True)
@@ -79,15 +79,7 @@ _Dumper.add_implicit_resolver(*_NUMBERS)
 
 def read_tree(path: Path) -> Node:
     """Read a YAML file whose top level is a mapping, without repeated keys."""
-    try:
-        text = whole_text(path)
-    except OSError as error:
-        raise InputError(f"cannot read {path}: {error.strerror}", "a YAML file") from error
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path} is not UTF-8 text", "a YAML file") from error
-    except ValueError as error:
-        raise InputError(f"cannot read {path}: {error}", "a YAML file") from error
-    return parse_tree(text, path.name)
+    return parse_tree(read_text(path, "a YAML file"), path.name)
 
 
 def parse_tree(text: str, source: str) -> Node:

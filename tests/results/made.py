@@ -1,14 +1,11 @@
-"""Results made by hand and by hypothesis."""
+"""Results made by hand."""
 
 from __future__ import annotations
-
-from hypothesis import strategies as st
 
 from coliags_plugin.results.hashing import metrics_sha256
 from coliags_plugin.results.record import (
     CostRecord,
     MetricRecord,
-    ProfileRecord,
     ProtocolRecord,
     Result,
     SceneRecord,
@@ -48,54 +45,3 @@ def made_result(sets=None, **changes) -> Result:
         "software": {"package_version": "1.0"},
     }
     return Result(sets=sets, **{**facts, **changes})
-
-
-numbers = st.floats(allow_nan=False, allow_infinity=False)
-names = st.text(min_size=1, max_size=8)
-plain = st.recursive(
-    st.none() | st.booleans() | st.integers() | numbers | st.text(max_size=8),
-    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(names, inner, max_size=3),
-    max_leaves=6,
-)
-
-
-def profiles_of(bins: int) -> st.SearchStrategy[ProfileRecord]:
-    """A profile of so many bins."""
-    errors = st.tuples(*[st.none() | numbers] * bins)
-    pixels = st.tuples(*[st.integers(0, 10**9)] * bins)
-    return st.builds(
-        ProfileRecord,
-        unit=names,
-        edges=st.just(tuple(range(bins + 1))),
-        pixels=pixels,
-        rgb_mse=errors,
-        depth_mse=errors,
-    )
-
-
-def sets_of(frames: list[str]) -> st.SearchStrategy[SetRecord]:
-    """A test set with these frames, and any of the metrics."""
-    values = st.tuples(*[st.none() | numbers] * len(frames))
-    return st.builds(
-        SetRecord,
-        frames=st.just(tuple(frames)),
-        values=st.dictionaries(st.sampled_from(sorted(METRICS)), values),
-        reasons=st.dictionaries(names, st.text(max_size=8), max_size=2),
-        predictions_sha256=st.just(PREDICTIONS),
-        truth_sha256=st.just(TRUTH),
-        profiles=st.dictionaries(names, st.integers(1, 4).flatmap(profiles_of), max_size=2),
-    )
-
-
-def results() -> st.SearchStrategy[Result]:
-    """Any result whose hash fits its values."""
-    marks = st.dictionaries(names, st.none() | numbers, max_size=3)
-    return st.builds(
-        made_result,
-        st.dictionaries(names, st.lists(names, max_size=4, unique=True).flatmap(sets_of), min_size=1, max_size=3),
-        method=names,
-        seed=st.integers(),
-        cost=st.builds(CostRecord, device=names, train_seconds=st.none() | numbers, seconds_to_psnr=marks),
-        config=st.dictionaries(names, plain, max_size=3),
-        provenance=st.dictionaries(names, plain, max_size=3),
-    )
