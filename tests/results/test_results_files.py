@@ -21,7 +21,7 @@ from coliags_plugin.results.reading import (
     read_result,
     write_result,
 )
-from coliags_plugin.results.record import VERSION, CostRecord, ProfileRecord, ProtocolRecord, Result
+from coliags_plugin.results.record import VERSION, CostRecord, ProfileRecord, ProtocolRecord
 from tests.commands import refused, run
 from tests.results.made import METRICS, made_result, made_set
 
@@ -134,12 +134,7 @@ def test_other_content_is_refused(content, part, tmp_path):
 @pytest.mark.parametrize(
     ("keys", "value", "part"),
     [
-        *(((name,), None, f"{name}: ") for name, field in Result.model_fields.items() if field.is_required()),
         (("seed",), "0", "seed: "),
-        (("seed",), 0.5, "seed: "),
-        (("scene", "size"), [32], "scene.size"),
-        (("scene", "fingerprint"), 3, "scene.fingerprint: "),
-        (("protocol", "version"), "one", "protocol.version: "),
         (("metrics", "psnr", "direction"), "up", "metrics.psnr.direction: "),
         (("sets", "test", "values", "psnr"), [30.0, "31.5"], "sets.test.values.psnr.1: "),
         (("sets", "test", "values", "psnr"), [30.0, math.nan], "sets.test.values.psnr.1"),
@@ -147,7 +142,6 @@ def test_other_content_is_refused(content, part, tmp_path):
         (("sets", "test", "values", "sharpness"), [1.0, 2.0], "values of sharpness, which `metrics`"),
         (("sets", "test", "frames"), ["0000", "0000"], "a frame is listed twice"),
         (("sets",), {}, "there is no test set"),
-        (("cost", "train_seconds"), "12 s", "cost.train_seconds: "),
         (("cost", "colour"), "red", "cost.colour: "),
         (("unheard_of",), 1, "unheard_of: "),
     ],
