@@ -11,7 +11,7 @@ from typing import Annotated, Any, Protocol, Union
 
 import tyro
 
-from coliags_plugin.cli import comparing, methods, poses, reconstruct, runs, scenes
+from coliags_plugin.cli import comparing, methods, poses, runs, scenes
 from coliags_plugin.cli.texts import in_flags, translate_for
 from coliags_plugin.core import __version__
 from coliags_plugin.core.errors import ReportedError
@@ -26,7 +26,7 @@ class Runnable(Protocol):
 
 #: Commands by their names, in the order of the help.
 COMMANDS: dict[str, type[Runnable]] = {
-    "reconstruct": reconstruct.ReconstructCommand,
+    "reconstruct": scenes.ReconstructCommand,
     "phantom": scenes.PhantomCommand,
     "train": runs.TrainCommand,
     "eval": runs.EvaluateCommand,

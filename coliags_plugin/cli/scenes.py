@@ -1,18 +1,33 @@
-"""Commands on scenes: ``coliags phantom``, ``data check``, ``depth estimate``."""
+"""Commands on scenes: ``coliags phantom``, ``data check``, ``depth estimate``, and ``reconstruct`` from a video."""
 
 from __future__ import annotations
 
 import logging
 import sys
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from coliags_plugin.cli.texts import ESTIMATED_DEPTH_METHOD, parse_size, print_summary, train_command
+from coliags_plugin.cli.texts import (
+    ESTIMATED_DEPTH_METHOD,
+    coliags,
+    parse_size,
+    print_summary,
+    train_command,
+    view_command,
+)
 from coliags_plugin.config import options
+from coliags_plugin.core.errors import InputError
+
+if TYPE_CHECKING:
+    from coliags_plugin.pipeline.contents import Contents
+    from coliags_plugin.pipeline.frame_sources import FrameSource
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -36,10 +51,6 @@ class PhantomCommand:
     """Preset of light and motion: c3vd is the fair default, strong the stress case."""
     gain: Literal["auto", "fixed"] | None = None
     """Exposure; default: the preset's."""
-    light_offset: options.OptionalText = None
-    """Lamp position X,Y,Z in camera axes, mm; default: the preset's."""
-    polyps: int | None = None
-    """Sessile polyps, 3 to 10 mm wide; 4 by default."""
     rotation_views: int | None = None
     """Extra test views, 12 by default, rotated by 15 to 30 degrees; none in layouts that cannot store them."""
     set: options.Assignments = ()
@@ -54,14 +65,12 @@ class PhantomCommand:
         from coliags_plugin.api.scenes import make_phantom
         from coliags_plugin.config.assignments import parse_assignments
 
-        names = ("preset", "trajectory", "frames", "light", "gain", "polyps", "rotation_views")
+        names = ("preset", "trajectory", "frames", "light", "gain", "rotation_views")
         values = {name: getattr(self, name) for name in names}
         options: dict[str, Any] = {"seed": self.seed, "layout": self.layout, "overwrite": self.overwrite}
         options |= {name: value for name, value in values.items() if value is not None}
         if self.size is not None:
             options["width"], options["height"] = parse_size(self.size)
-        if self.light_offset is not None:
-            options |= parse_assignments([f"light_offset=[{self.light_offset}]"])
         options |= parse_assignments(self.set)
         folder = make_phantom(self.output, **options)
         print_summary(facts={"settings": options}, written=[folder], then=[train_command(folder)], as_json=self.json)
@@ -141,7 +150,6 @@ class DepthCommand:
     def run(self) -> None:
         """Estimate, or resume; write the scene and print a summary."""
         from coliags_plugin.config.assignments import settings_of
-        from coliags_plugin.core.errors import InputError
         from coliags_plugin.core.files import refuse_existing, refuse_overlap
         from coliags_plugin.engine.data_formats import open_scene
         from coliags_plugin.engine.progress import progress_callback
@@ -166,6 +174,145 @@ class DepthCommand:
                 scene, self.output, settings, near_far, self.prior, self.jobs, self.overwrite, progress
             )
         for warning in estimated.warnings:
-            logging.getLogger(__name__).warning(warning)
+            log.warning(warning)
         train = train_command(self.output, ESTIMATED_DEPTH_METHOD, training_options(scene))
         print_summary(estimated.summary, written=[self.output], then=[train], as_json=self.json)
+
+
+@dataclass(frozen=True)
+class ReconstructCommand(options.ReconstructOptions):
+    """Reconstruct a colon from a video alone: frames, poses, depth, training, mesh, coverage and report.
+
+    Each stage is kept: repeated, the command goes on with what is missing, also after a kill.
+    """
+
+    camera: options.OptionalText = None
+    """A known camera, scaled to the frames (c3vd: whole frames of C3VD; c3vd-undistorted; NAME.xml: of a calibration
+    file), or a camera model of COLMAP; default: of the calibration file in the folder, else found from the frames."""
+    params: Annotated[options.OptionalText, tyro.conf.arg(metavar="P1,P2,...")] = None
+    """Parameters of COLMAP's model, for the frames' size, pixel centres at integers + 0.5; default: estimated."""
+    diameter: options.OptionalFloat = None
+    """The colon's typical inner diameter, which gives lengths in mm, roughly; default: their unit stays unknown."""
+    start: Annotated[options.OptionalText, tyro.conf.arg(name="from", metavar="[H:]M:SS")] = None
+    """Time in the video of the first frame, for instance 3:20; default: the beginning."""
+    end: Annotated[options.OptionalText, tyro.conf.arg(name="to", metavar="[H:]M:SS")] = None
+    """Time of the last frame; default: the end."""
+    every: options.OptionalInt = None
+    """Use the sharpest of every n frames; default: all."""
+    frames_per_second: Annotated[float | None, tyro.conf.arg(metavar="F", help_behavior_hint="")] = None
+    """Use about so many frames a second, in place of --every: the sharpest of every n by the video's rate, or of every
+    1/F s of a variable one."""
+    size: options.OptionalText = None
+    """Size WxH of the images that depth is estimated from and training sees, pixels; default: what fits 338x270."""
+    method: options.OptionalText = None
+    """Method to train; default: coliags-in-vivo, or coliags for a scene with depth."""
+    steps: options.OptionalInt = None
+    """Training steps of 100 frames, and at least of the largest sub-map; default 2000 (docs/reconstruct.md 1)."""
+    json: options.AsJson = False
+
+    def run(self) -> None:
+        """Run the stages that are not done, and print what there is."""
+        from coliags_plugin.api.scenes import reconstruct
+        from coliags_plugin.config.assignments import assignments, parse_assignments
+        from coliags_plugin.pipeline.contents import read_contents
+        from coliags_plugin.pipeline.stages import PAGE_FILE
+
+        options: dict[str, Any] = {
+            "sfm.camera.model": self.camera,
+            "sfm.camera.params": None
+            if self.params is None
+            else parse_assignments([f"params=[{self.params}]"])["params"],
+            "diameter": self.diameter,
+            **self._frames(),
+            "size": None if self.size is None else parse_size(self.size),
+            "method": self.method,
+            "steps": self.steps,
+        }
+        settings = {key: value for key, value in options.items() if value is not None}
+        record = reconstruct(replace(self, settings=(*assignments(settings), *self.settings)))
+        contents = read_contents(self.output, record, scene=self.video)
+        finished = [submap for submap in contents.submaps if "report" in submap.stages and not submap.failure]
+        largest = max(finished, key=lambda submap: len(submap.names))
+        print_summary(
+            "\n".join(_lines(contents)),
+            {"stages": {name: asdict(stage) for name, stage in record.stages.items()}},
+            written=[self.output / PAGE_FILE],
+            then=[
+                view_command(self.output / largest.folder / "run"),
+                coliags("poses", "export", self.output, "--output", f"{self.output}-atlas"),
+            ],
+            as_json=self.json,
+        )
+
+    def _frames(self) -> dict[str, Any]:
+        """Settings of which frames are used, None where nothing is given."""
+        from coliags_plugin.pipeline.frame_sources import frame_source
+
+        if self.every is not None and self.frames_per_second is not None:
+            raise InputError("--every and --frames-per-second", "one of them")
+        if self.start is None and self.end is None and self.frames_per_second is None:
+            return {"frames.every": self.every}
+        source = frame_source(self.video)
+        first, last = (None if time is None else source.frame_at(seconds_of(time)) for time in (self.start, self.end))
+        frames = {"frames.first": first, "frames.last": last, "frames.every": self.every}
+        if self.frames_per_second is None:
+            return frames
+        every, by_time = every_of(source, self.frames_per_second), source.is_variable
+        return {**frames, "frames.every": every, "frames.per_second": self.frames_per_second if by_time else None}
+
+
+def seconds_of(time: str) -> float:
+    """Seconds of a time such as ``200``, ``3:20`` or ``1:02:03.5`` (seconds, minutes, hours)."""
+    try:
+        parts = [float(part) for part in time.split(":")]
+        if len(parts) > 3 or min(parts) < 0.0:
+            raise ValueError
+    except ValueError:
+        expected = "seconds, or hours, minutes and seconds such as 3:20 or 1:02:03.5"
+        raise InputError(f"the time '{time}'", expected) from None
+    return sum(part * 60.0**power for power, part in enumerate(reversed(parts)))
+
+
+def every_of(source: FrameSource, rate: float) -> int:
+    """The n for which one of every n frames gives about ``rate`` frames a second.
+
+    Raises:
+        InputError: ``rate`` is no positive number, or the source does not tell how many frames a second it has.
+    """
+    from coliags_plugin.pipeline.video_files import FASTEST
+
+    if not 0.0 < rate < FASTEST:
+        raise InputError(f"--frames-per-second {rate:g}", f"a number between 0 and {FASTEST:g}")
+    recorded = source.known_rate
+    every = max(1, round(recorded / rate))
+    if source.is_variable:
+        what = "%s has a variable rate, of %.4g frames a second in the mean: the sharpest of every 1/%.4g s is used"
+        log.info(what, source.path, recorded, rate)
+    else:
+        what = "%s has %.4g frames a second: the sharpest of every %d is used, %.3g a second"
+        log.info(what, source.path, recorded, every, recorded / every)
+    return every
+
+
+def _lines(contents: Contents) -> Iterator[str]:
+    """Lines of what a video came to: stages and files, segments and joins of a long one, sub-maps, and remarks."""
+    from coliags_plugin.pipeline.page import held_out_text, remarks, submap_table
+    from coliags_plugin.reporting.text_formats import terminal_text
+
+    folder, submaps = contents.folder, [submap for submap in contents.submaps if submap.stages]
+    stages = {name: stage for name, stage in contents.stages.items() if "/" not in name}
+    yield from (f"{name}: {stage.summary}" for name, stage in stages.items())
+    yield from (f"{folder / path}: {content}" for stage in stages.values() for path, content in stage.files.items())
+    for segment in contents.segments if len(contents.segments) > 1 else ():
+        span, poses = segment.span, segment.stages.get("poses")
+        outcome = "not begun" if poses is None else poses.summary.partition("\n")[0]
+        yield f"{span.name}, frames {span.first} to {span.last}: {outcome}"
+    for skipped in contents.video.skipped:
+        yield f"frames {skipped.first} to {skipped.last} left out: {skipped.why}"
+    for join in contents.joins:
+        models = [f"{name}/{Path(model).name}" if model else name for name, model in join.keys]
+        yield f"{' and '.join(models)}: {'joined' if join.joined else f'not joined: {join.reason}'}"
+    if len(submaps) > 1:
+        yield from (f"{folder / submap.folder}: {submap.name}" for submap in submaps)
+        yield from ("", terminal_text([submap_table(contents)]), "", f"held-out PSNR: {held_out_text(submaps)}")
+    yield from remarks(contents)

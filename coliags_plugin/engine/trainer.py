@@ -31,13 +31,12 @@ from coliags_plugin.core.render_output import BLANK_ALPHA, RenderOutput, concate
 from coliags_plugin.core.scenes import Frame, Scene, Target, View, concatenate_targets
 from coliags_plugin.core.tensors import masked_mean, sent
 from coliags_plugin.engine import checkpoints
-from coliags_plugin.engine.compatibility import check_components
 from coliags_plugin.engine.costs import CostMeter, HeapTrimmer, TrainingCost
 from coliags_plugin.engine.data_formats import at_scale, load_method_for, load_scene, training_scale
 from coliags_plugin.engine.devices import software
 from coliags_plugin.engine.evaluator import check_evaluable
 from coliags_plugin.engine.loggers import Followers
-from coliags_plugin.engine.model import Model, make_view_modules
+from coliags_plugin.engine.model import Model, check_components, make_view_modules
 from coliags_plugin.engine.optimizers import Optimizers
 from coliags_plugin.engine.progress import ProgressReport
 from coliags_plugin.engine.run_folder import RunFolder

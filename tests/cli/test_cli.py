@@ -218,7 +218,7 @@ def test_what_train_and_phantom_cannot_make(capsys, scene, tmp_path):
     argv = ("train", "coliags", "--data", scene, "--output", tmp_path / "file" / "run", "--steps", 1, *SETS)
     assert "cannot write" in refused(capsys, *argv)
     assert "cannot write" in refused(capsys, "phantom", "-o", tmp_path / "file" / "phantom", "--frames", 9)
-    options = ("--size big", "--size 0x0", "--light-offset 1,2", "--frames 3", "--set roughnes=0.3", "--set roughness")
+    options = ("--size big", "--size 0x0", "--frames 3", "--set light_offset=[1,2]", "--set roughnes=0.3", "--set a")
     for words in options:
         refused(capsys, "phantom", "-o", tmp_path / "p", *words.split())
     assert [path.name for path in tmp_path.iterdir()] == ["file"]

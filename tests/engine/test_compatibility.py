@@ -13,8 +13,7 @@ from coliags_plugin.contracts import ViewModule
 from coliags_plugin.core.errors import InputError, NothingDrawnError
 from coliags_plugin.core.provenance import Provenance
 from coliags_plugin.core.scenes import SparseDepth, View
-from coliags_plugin.engine.compatibility import _check_data, _check_sampler
-from coliags_plugin.engine.model import Model
+from coliags_plugin.engine.model import Model, _check_data, _check_sampler
 from coliags_plugin.losses.target import L1Loss
 from coliags_plugin.modules.exposure import FrameGain
 from coliags_plugin.renderers.splatting import ChosenRenderer

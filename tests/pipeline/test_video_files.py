@@ -12,7 +12,7 @@ import av
 import numpy as np
 import pytest
 
-from coliags_plugin.cli.reconstruct import every_of, seconds_of
+from coliags_plugin.cli.scenes import every_of, seconds_of
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import write_image
 from coliags_plugin.geometry.lenses.models import LENSES
