@@ -16,7 +16,7 @@ from torch.autograd.function import once_differentiable
 
 from coliags_plugin.core.numba_kernels import lanes as vec
 from coliags_plugin.core.numba_kernels.compilation import inline, kernel, part
-from coliags_plugin.core.numba_kernels.threads import pieces, workers
+from coliags_plugin.core.numba_kernels.threads import Crew, pieces
 from coliags_plugin.core.tensors import tables
 
 #: Parts of the Gaussians whose sums are kept apart, so that they do not depend on the number of threads.
@@ -50,16 +50,14 @@ class _Attenuate(torch.autograd.Function):
         view = torch.cat([lamp.detach(), axis.detach(), bounds.flatten()])
         ctx.seen = tables(colors, positions, facing, view, exponents)
         result = torch.empty(colors.shape)
-        with workers() as run:
-            run(attenuate, *ctx.seen, *tables(result))
+        Crew().run(attenuate, *ctx.seen, *tables(result))
         return result
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, of_result: Tensor) -> tuple[Tensor | None, ...]:
         of_colors, sums = torch.empty(of_result.shape), torch.empty(SLABS, 16)
-        with workers() as run:
-            run(attenuate_backward, *ctx.seen, *tables(of_result, of_colors, sums))
+        Crew().run(attenuate_backward, *ctx.seen, *tables(of_result, of_colors, sums))
         total = sums.sum(0)
         # Of logarithms to base 2, and of their powers, the exponents' derivatives have the factor ln 2.
         return of_colors, total[9:12], total[12:15], math.log(2.0) * total[:9].view(3, 3), None, None, None
