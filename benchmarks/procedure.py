@@ -36,7 +36,7 @@ from coliags_plugin.core.images import read_rgb
 from coliags_plugin.core.json_files import read_json
 from coliags_plugin.core.scene_files import read_intrinsics
 from coliags_plugin.datamanagers.colmap import read_atlas
-from coliags_plugin.datamanagers.reading.depth import C3VD_DEPTH
+from coliags_plugin.datamanagers.reading.images import C3VD_DEPTH
 from coliags_plugin.geometry.lenses.models import PinholeLens
 from coliags_plugin.geometry.meshes.mesh import TriangleMesh, read_mesh
 from coliags_plugin.geometry.meshes.truth import TrueSurface, compare_meshes
@@ -354,7 +354,7 @@ class Truth:
         phantom, index = divmod(number, FRAMES + BETWEEN)
         if index >= FRAMES:
             return np.full(len(pixels), np.nan)
-        depth = C3VD_DEPTH.z_depth(C3VD_DEPTH.read(self._folders[phantom] / "depths" / f"{index:04d}_depth.png"))
+        depth, _ = C3VD_DEPTH.decode(C3VD_DEPTH.read(self._folders[phantom] / "depths" / f"{index:04d}_depth.png"))
         column, row = np.clip(pixels.astype(int), 0, np.array(depth.shape[::-1]) - 1).T
         return np.asarray(depth[row, column])
 

@@ -51,9 +51,6 @@ _DEFAULT_LAYOUT, _LAYOUTS_WITH = "c3vd", {"sparse_depth": "colmap"}
 
 _PACKAGE = Path(__file__).parents[1]
 _LIBRARIES = tuple(Path(sysconfig.get_path(name)) for name in ("stdlib", "platstdlib", "purelib", "platlib"))
-#: Modules whose code is no part of a method.
-_CHECKS = {__name__, "coliags_plugin.testing"}
-
 T = TypeVar("T")
 
 
@@ -174,8 +171,7 @@ class CheckContext:
         message = "; ".join(str(error).split("\n"))
         if isinstance(error, ReportedError):
             return message
-        parts = components(self.loaded.config) if "loaded" in vars(self) else {}
-        location = _location(error, {str(part.target.__module__).partition(".")[0] for part in parts.values()})
+        location = _location(error)
         return f"{type(error).__name__}: {message}{f' ({location})' if location else ''}"
 
 
@@ -215,18 +211,13 @@ def _nested(path: str, node: Any) -> Iterator[tuple[str, Component]]:
         yield from _nested(f"{path}.{name}", child)
 
 
-def _location(error: BaseException, packages: set[str]) -> str:
-    """``file:line`` of the innermost frame in these packages or in code that is no library's; else in this package."""
-    places: dict[bool, str] = {}
-    for frame, number in traceback.walk_tb(error.__traceback__):
-        path, module = Path(frame.f_code.co_filename), str(frame.f_globals.get("__name__"))
-        ours = path.is_relative_to(_PACKAGE)
-        users = not ours and (
-            module.partition(".")[0] in packages or not any(path.is_relative_to(root) for root in _LIBRARIES)
-        )
-        if users or (ours and module not in _CHECKS):
-            places[users] = f"{path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path}:{number}"
-    return places.get(True, places.get(False, ""))
+def _location(error: BaseException) -> str:
+    """``file:line`` of the innermost frame in code that is neither a library's nor this package's; empty without."""
+    for frame, number in reversed(list(traceback.walk_tb(error.__traceback__))):
+        path = Path(frame.f_code.co_filename)
+        if not any(path.is_relative_to(root) for root in (_PACKAGE, *_LIBRARIES)):
+            return f"{path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path}:{number}"
+    return ""
 
 
 def _write_phantom(method: str, overrides: Sequence[str], folder: Path) -> Path:

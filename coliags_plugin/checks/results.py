@@ -14,7 +14,6 @@ from coliags_plugin.core.errors import InterruptedRunError
 Status = Literal["passed", "failed", "skipped"]
 
 _TICKS: dict[Status, str] = {"passed": "\u2713", "failed": "\u2717", "skipped": "-"}
-_WORDS: dict[Status, str] = {"passed": "ok  ", "failed": "FAIL", "skipped": "-   "}
 
 
 class CheckFailedError(AssertionError):
@@ -61,18 +60,10 @@ def run_check(name: str, check: Callable[[], str], describe: Callable[[Exception
     return CheckResult(name, status, detail, time.monotonic() - start, trace)
 
 
-def line(result: CheckResult, width: int, encoding: str) -> str:
-    """One result: tick, cross or dash, name padded to ``width``, seconds and detail.
-
-    Words stand for ticks, and escapes for characters, that the encoding of where it is printed does not have.
-    """
-    try:
-        "".join(_TICKS.values()).encode(encoding)
-        mark = _TICKS[result.status]
-    except UnicodeEncodeError:
-        mark = _WORDS[result.status]
+def line(result: CheckResult, width: int) -> str:
+    """One result: tick, cross or dash, name padded to ``width``, seconds and detail."""
     seconds = f"{result.seconds:6.1f} s" if result.status != "skipped" else 8 * " "
-    return _printable(f"{mark} {result.name:<{width}} {seconds}  {result.detail}".rstrip(), encoding)
+    return f"{_TICKS[result.status]} {result.name:<{width}} {seconds}  {result.detail}".rstrip()
 
 
 def summary(results: Sequence[CheckResult]) -> str:
@@ -82,10 +73,6 @@ def summary(results: Sequence[CheckResult]) -> str:
     return f"{parts} in {sum(result.seconds for result in results):.1f} s"
 
 
-def tracebacks(results: Sequence[CheckResult], encoding: str) -> list[str]:
+def tracebacks(results: Sequence[CheckResult]) -> list[str]:
     """Name and traceback of every check that ended with an exception."""
-    return [_printable(f"\n{result.name}:\n{result.traceback}", encoding) for result in results if result.traceback]
-
-
-def _printable(text: str, encoding: str) -> str:
-    return text.encode(encoding, errors="backslashreplace").decode(encoding)
+    return [f"\n{result.name}:\n{result.traceback}" for result in results if result.traceback]

@@ -9,6 +9,7 @@ import tempfile
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from functools import partial
+from io import TextIOWrapper
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -112,16 +113,18 @@ class CheckCommand:
         from coliags_plugin.checks.results import line, summary, tracebacks
         from coliags_plugin.testing import METHOD_CHECKS, CheckContext, name_of_check
 
-        encoding, width = sys.stdout.encoding or "ascii", max(len(name_of_check(check)) for check in METHOD_CHECKS)
+        if isinstance(sys.stdout, TextIOWrapper):
+            sys.stdout.reconfigure(errors="backslashreplace")  # where an encoding has no ticks
+        width = max(len(name_of_check(check)) for check in METHOD_CHECKS)
         context = CheckContext(self.method, folder, self.set, self.data, self.data_format, self.steps)
         results = []
         for check in METHOD_CHECKS:
             results.append(context.outcome(check))
             if not self.json:
-                print(in_flags(line(results[-1], width, encoding)), flush=True)
+                print(in_flags(line(results[-1], width)), flush=True)
         text = summary(results)
         if self.traceback:
-            text += "\n" + "".join(tracebacks(results, encoding))
+            text += "\n" + "".join(tracebacks(results))
         facts = {"checks": [asdict(result) for result in results]}
         print_summary(text, facts, written=[folder] if self.keep else [], as_json=self.json)
         return any(result.status == "failed" for result in results)

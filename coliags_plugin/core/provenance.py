@@ -59,7 +59,6 @@ class Provenance(_Record):
     #: Test frames that "depth" or "points" were made from, by name; None where it is unknown which.
     held_out_used: dict[str, list[str] | None] = {}
     frames: dict[str, int] = {}  # number of frames, in the sequence and by part
-    invalid_depth_share: float | None = None  # share of the unmasked pixels
     training_scale: float = 1.0  # factor on lengths during training
 
     def record(self) -> JsonObject:

@@ -12,7 +12,7 @@ from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from pathlib import Path, PurePosixPath
-from typing import Literal, TypeVar, cast, get_args
+from typing import Any, Literal, TypeVar, cast, get_args
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_write, write_json
@@ -83,19 +83,35 @@ def required_file(path: Path, expected: str, do: str = "Restore it, or check the
     return path
 
 
-def for_all(files: Mapping[str, Path | None], where: object, what: str, or_none: bool = True) -> list[Path | None]:
-    """Files by the name of their frame, of which there must be one for every frame or, unless ``or_none``, for none.
+def for_every(files: Mapping[str, Path | None], where: object, what: str, or_none: str = "") -> list[Path]:
+    """Files by the name of their frame, of which there must be one for every frame.
 
     ``where`` they are missing and ``what`` they are is for the error.
     """
     missing = [name for name, path in files.items() if path is None]
-    if missing and not (or_none and len(missing) == len(files)):
+    if missing:
         raise InputError(
             f"{where}: {len(files) - len(missing)} of {len(files)} frames have {what}; {missing[0]} has none",
-            f"{what} for every frame, or none at all",
+            f"{what} for every frame{or_none}",
             "Restore the missing ones: incomplete archives are common",
         )
-    return list(files.values())
+    return [path for path in files.values() if path is not None]
+
+
+def for_all(files: Mapping[str, Path | None], where: object, what: str) -> Sequence[Path | None]:
+    """Files by the name of their frame, as by :func:`for_every`, or None for every frame."""
+    return for_every(files, where, what, ", or none at all") if any(files.values()) else list(files.values())
+
+
+def same_frames(folder: Path, images: Collection[Any], depths: Collection[Any], do: str) -> None:
+    """Raise InputError unless there is depth for every image or for none, by the numbers in their names."""
+    if depths and (lone := set(depths) ^ set(images)):
+        counts = f"{len(images)} images and {len(depths)} depth files"
+        raise InputError(
+            f"{folder} has {counts}; frame {min(lone)} has only one of the two",
+            "a depth file for every image, or none at all",
+            do,
+        )
 
 
 def numbered(folder: Path, what: str, suffixes: frozenset[str]) -> dict[int, Path]:
@@ -151,13 +167,7 @@ def paired(
             "numbers from 0 without gaps, as line n of the pose file belongs to image n",
             "Restore the missing images, or renumber them and drop their poses",
         )
-    if depths and sorted(depths) != sorted(images):
-        lone = min(set(depths) ^ set(images))
-        raise InputError(
-            f"{folder} has {count} images and {len(depths)} depth files; frame {lone} has only one of the two",
-            "a depth file for every image, or none at all",
-            "Restore the missing files: incomplete archives are common",
-        )
+    same_frames(folder, images, depths, "Restore the missing files: incomplete archives are common")
     frames = range(count)
     return tuple(images[index] for index in frames), tuple(depths[index] for index in frames) if depths else None
 
@@ -269,14 +279,7 @@ def write_unit(folder: Path, unit: Unit) -> None:
 def read_intrinsics(path: Path) -> Intrinsics:
     """The intrinsics of a ``camera.json``."""
     data = read_json(path, "a JSON object")
-    keys = ("fx", "fy", "cx", "cy", "w", "h")
-    if not isinstance(data, dict) or any(key not in data for key in keys):
-        missing = [key for key in keys if not isinstance(data, dict) or key not in data]
-        raise InputError(
-            f"{path} has no {', '.join(missing)}",
-            "fx, fy, cx, cy in pixels (centres at integers) and the image's w, h",
-            "Add them",
-        )
+    data = data if isinstance(data, dict) else {}
     fx, fy = (read_number(data, key, path, "a number above 0", above=0.0) for key in ("fx", "fy"))
     cx, cy = (read_number(data, key, path) for key in ("cx", "cy"))
     return Intrinsics(fx, fy, cx + 0.5, cy + 0.5, *image_size(data, path))

@@ -17,20 +17,12 @@ from typing_extensions import override
 from coliags_plugin.core import scene_files as reading
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.text_files import read_text
-from coliags_plugin.datamanagers.fusion import load_points
-from coliags_plugin.datamanagers.reading.depth import C3VD_DEPTH
-from coliags_plugin.datamanagers.recorded import (
-    ROTATION,
-    RecordedDataManager,
-    Recording,
-    find_seen_masks,
-    fingerprint,
-    poses_of_images,
-)
+from coliags_plugin.datamanagers.reading.images import C3VD_DEPTH
+from coliags_plugin.datamanagers.recorded import ROTATION, RecordedDataManager, Recording, poses_of_images
 from coliags_plugin.datamanagers.scene_settings import POINTS_FILE, SceneSettings
 from coliags_plugin.datamanagers.shots import Rectification, Shot, make_shots, whole_frame
 from coliags_plugin.geometry.lenses.models import LENSES, Lens, OmnidirectionalLens, PinholeLens, octagon_mask
-from coliags_plugin.geometry.poses import c3vd as c3vd_poses
+from coliags_plugin.geometry.poses.formats import count_first_numbers
 
 log = logging.getLogger(__name__)
 
@@ -71,26 +63,23 @@ class SequenceDataManager(RecordedDataManager):
     def open(self, path: Path) -> Recording:
         files = self.find(path)
         shots, facts = self._shots(files)
-        test_sets, seen_masks = {}, {"video": find_seen_masks(path / "truth", len(shots))}
+        test_sets = {}
         if (path / ROTATION).is_dir():
-            rotation = self.find(path / ROTATION)
-            test_sets[ROTATION], facts[ROTATION] = self._shots(rotation, f"{ROTATION}-")
-            seen_masks[ROTATION] = find_seen_masks(path / ROTATION, len(rotation.images))
-        points = path / POINTS_FILE
+            test_sets[ROTATION], facts[ROTATION] = self._shots(self.find(path / ROTATION), f"{ROTATION}-")
         return Recording(
+            folder=path,
             kind=f"{files.kind} layout, {facts['pose_convention']['order']} poses",
             shots=shots,
             facts=facts,
-            fingerprint=fingerprint(path, (*files.images, *(files.depths or ())), (files.poses, files.camera)),
+            described_by=(files.poses, files.camera),
             test_sets=test_sets,
-            own_points=(lambda: load_points(points)) if points.is_file() else None,
-            points_source=points,
-            seen=seen_masks,
+            points_source=path / POINTS_FILE,
         )
 
     def octagon_rectification(self, lens: Lens, image: Path, mask: bool) -> Rectification:
         """The rectification of raw frames like ``image``, optionally masked outside the octagon."""
-        lens = whole_frame(lens, image)
+        do = "Undistort cropped images yourself and give them in the undistorted layout"
+        lens = whole_frame(lens, image, "the lens", do)
         shows = octagon_mask(lens.width, lens.height) if mask else None
         return self.rectification_of(lens, image, shows)
 
@@ -101,7 +90,6 @@ class SequenceDataManager(RecordedDataManager):
         facts: dict[str, Any] = {
             "layout": files.kind,
             **described,
-            **rectification.facts(),
             "pose_convention": {"order": poses.convention, **poses.evidence},
         }
         return shots, facts
@@ -143,29 +131,24 @@ class C3VDDataManager(SequenceDataManager):
     def find(self, folder: Path) -> SequenceFiles:
         """``kind`` is ``raw`` (distorted) or ``undistorted`` (pinhole images)."""
         reading.require_folder(folder, f"a C3VD sequence: {LAYOUTS}")
-        raw = [path for path in folder.iterdir() if re.fullmatch(r"\d+_color\.png", path.name)]
-        camera = None
-        if raw and (folder / "images").is_dir():
-            raise InputError(
-                f"{folder} holds both {raw[0].name} and images/",
-                "one sequence in one layout",
-                "Move one of the two to its own folder",
-            )
-        if raw:
-            kind, poses = "raw", folder / "pose.txt"
-            images = reading.numbered(folder, "color", frozenset({".png"}))
-            depths = reading.numbered(folder, "depth", reading.TIFF_SUFFIXES)
-        elif (folder / "images").is_dir():
+        kind, poses, camera = "raw", folder / "pose.txt", None
+        images = reading.numbered(folder, "color", frozenset({".png"}))
+        depths = reading.numbered(folder, "depth", reading.TIFF_SUFFIXES)
+        image_folder = folder
+        if (folder / "images").is_dir():
+            if images:
+                raise InputError(
+                    f"{folder} holds both {images[min(images)].name} and images/",
+                    "one sequence in one layout",
+                    "Move one of the two to its own folder",
+                )
             kind, poses, camera = "undistorted", folder / "camera_pose.txt", folder / "camera.json"
-            images = reading.numbered(folder / "images", "color", reading.IMAGE_SUFFIXES)
+            image_folder = folder / "images"
+            images = reading.numbered(image_folder, "color", reading.IMAGE_SUFFIXES)
             depths = reading.numbered(folder / "depths", "depth", reading.DEPTH_SUFFIXES)
-        else:
-            do = "Name the sequence's own folder, for instance cecum_t1_a"
-            raise InputError(f"{folder} holds {reading.inventory(folder)}", LAYOUTS, do)
         if not images:
-            raise InputError(
-                f"{folder / 'images'} holds {reading.inventory(folder / 'images')}", "<number>_color.png files"
-            )
+            do = "Name the sequence's own folder, for instance cecum_t1_a"
+            raise InputError(f"{image_folder} holds {reading.inventory(image_folder)}", LAYOUTS, do)
         for path in filter(None, (poses, camera)):
             if not path.is_file():
                 raise InputError(f"{folder} has images but no {path.name}", LAYOUTS, f"Add {path.name}")
@@ -177,7 +160,6 @@ class C3VDDataManager(SequenceDataManager):
         raw = files.camera is None
         facts = {
             "lens": settings.lens if raw else None,
-            "focal_scale": settings.focal_scale if raw else None,
             "mask": "octagon" if raw and settings.mask else None,
         }
         if files.camera is not None:
@@ -293,7 +275,7 @@ class C3VDv2DataManager(SequenceDataManager):
     @override
     def recognise(cls, path: Path) -> str | None:
         numbers = any(re.fullmatch(r"\d+", image.stem) for image in path.glob("rgb/*.png"))
-        if numbers and (path / "pose.txt").is_file() and c3vd_poses.recognise(path / "pose.txt"):
+        if numbers and (path / "pose.txt").is_file() and count_first_numbers(path / "pose.txt") == 16:
             return "pose.txt (16 numbers a line) beside rgb/NNNN.png"
         return None
 
@@ -317,7 +299,6 @@ class C3VDv2DataManager(SequenceDataManager):
         facts = {
             "lens": settings.lens,
             "lens_source": source,
-            "focal_scale": settings.focal_scale,
             "mask": "octagon" if settings.mask else None,
         }
         return self.octagon_rectification(lens, files.images[0], settings.mask), facts

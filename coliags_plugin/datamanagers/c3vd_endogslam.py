@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import re
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -23,22 +24,14 @@ from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.core.ply import read_vertices
 from coliags_plugin.core.scenes import PointCloud
 from coliags_plugin.core.splits import Split
-from coliags_plugin.datamanagers.reading.depth import C3VD_DEPTH, ScaledDepth
-from coliags_plugin.datamanagers.reading.images import size_of
-from coliags_plugin.datamanagers.recorded import (
-    ROTATION,
-    RecordedDataManager,
-    Recording,
-    find_seen_masks,
-    fingerprint,
-    poses_of_images,
-)
+from coliags_plugin.datamanagers.reading.images import C3VD_DEPTH, ScaledDepth
+from coliags_plugin.datamanagers.recorded import ROTATION, RecordedDataManager, Recording, poses_of_images
 from coliags_plugin.datamanagers.scene_settings import InitialPoints, SceneSettings
-from coliags_plugin.datamanagers.shots import ASPECT_TOLERANCE, Rectification, Shot, make_shots
+from coliags_plugin.datamanagers.shots import Rectification, Shot, make_shots, whole_frame
 from coliags_plugin.geometry.lenses.models import PinholeLens
-from coliags_plugin.geometry.poses import c3vd as c3vd_poses
 from coliags_plugin.geometry.poses.c3vd import C3vdPoses
 from coliags_plugin.geometry.poses.endogslam import EndoGslamParams, image_indices, read_params
+from coliags_plugin.geometry.poses.formats import count_first_numbers
 from coliags_plugin.geometry.poses.trajectory import inverse, rigid, rotation_angles_deg
 
 log = logging.getLogger(__name__)
@@ -81,11 +74,10 @@ def load_poses(files: PreparedFiles, params: EndoGslamParams | None, source: Pos
     """
     count = len(files.images)
     file = None if files.poses is None else poses_of_images(files.poses, count)
-    indices, from_true, slam = (None, None, None) if params is None else _align_slam(files, params, file)
     facts: dict[str, Any] = {
         "poses": source,
         "pose_convention": None if file is None else {"order": file.convention, **file.evidence},
-        "slam": slam,
+        "slam": None,
     }
     if source == "slam" and params is None:
         raise InputError(
@@ -93,29 +85,35 @@ def load_poses(files: PreparedFiles, params: EndoGslamParams | None, source: Pos
             "EndoGSLAM's result, for option poses: slam",
             "Name it with `datamanager.params_file=FILE`, or `datamanager.poses=ground-truth`",
         )
-    tracked = 0 if indices is None else len(indices)
-    if file is None and tracked != count:
-        has = f", and {files.params} poses of {tracked} of {count} images alone" if tracked else ""
-        raise InputError(
-            f"{files.folder} has no pose.txt{has}",
-            "a pose for every image",
-            "Put the sequence's pose.txt of C3VD's release there",
+    if params is None:
+        if file is None:
+            raise _no_true_poses(files.folder, "")
+        return SequencePoses(file.camera_to_world, None, np.eye(4), {**facts, "world": "pose.txt"})
+    indices, from_true, facts["slam"] = _align_slam(files, params, file)
+    if file is None and len(indices) != count:
+        raise _no_true_poses(files.folder, f", and {files.params} poses of {len(indices)} of {count} images alone")
+    # The true poses of params.npz are relative to the first camera.
+    first = np.eye(4) if file is None else file.camera_to_world[0]
+    from_file = None if file is None else from_true @ _inverse(first)
+    if source == "ground-truth":
+        true, world = (
+            (params.true_camera_to_world, "first camera") if file is None else (file.camera_to_world, "pose.txt")
         )
-    if source == "slam" and params is not None:
-        camera_to_world, from_file = params.camera_to_world, None
-        if file is not None:
-            from_file = from_true @ _inverse(file.camera_to_world[0])
-            if tracked != count:
-                camera_to_world = from_file @ file.camera_to_world
-                camera_to_world[indices] = params.camera_to_world
-        return SequencePoses(camera_to_world, np.eye(4), from_file, {**facts, "world": "first camera, as mapped"})
-    from_slam = None if from_true is None else _inverse(from_true)
-    if file is None:
-        assert params is not None  # as tracked says
-        return SequencePoses(params.true_camera_to_world, from_slam, None, {**facts, "world": "first camera"})
-    if from_slam is not None:
-        from_slam = file.camera_to_world[0] @ from_slam
-    return SequencePoses(file.camera_to_world, from_slam, np.eye(4), {**facts, "world": "pose.txt"})
+        to_itself = None if file is None else np.eye(4)
+        return SequencePoses(true, first @ _inverse(from_true), to_itself, {**facts, "world": world})
+    camera_to_world = params.camera_to_world
+    if file is not None and len(indices) != count:
+        camera_to_world = from_file @ file.camera_to_world
+        camera_to_world[indices] = params.camera_to_world
+    return SequencePoses(camera_to_world, np.eye(4), from_file, {**facts, "world": "first camera, as mapped"})
+
+
+def _no_true_poses(folder: Path, instead: str) -> InputError:
+    return InputError(
+        f"{folder} has no pose.txt{instead}",
+        "a pose for every image",
+        "Put the sequence's pose.txt of C3VD's release there",
+    )
 
 
 def _align_slam(
@@ -140,7 +138,7 @@ def _align_slam(
         compared = _compared(files, params.true_camera_to_world, true, indices)
     from_true = _rigid_alignment(params.true_camera_to_world, params.camera_to_world)
     aligned = from_true @ params.true_camera_to_world
-    errors, angles = _apart(aligned, params.camera_to_world)
+    errors, _ = _apart(aligned, params.camera_to_world)
     ate, spread = float(np.sqrt(np.mean(errors**2))), float(aligned[:, :3, 3].std(axis=0).max())
     if ate > LOST * spread:
         log.warning(
@@ -154,11 +152,8 @@ def _align_slam(
         "params": str(path),
         "frames": poses,
         "images": "every" if poses == count else "all but 7, 15, 23, ...",
-        "other_images": None if poses == count else "true poses, brought into the mapped world by a rigid fit",
         "compared_with_pose_file": compared,
         "ate_rmse_mm": ate,
-        "ate_max_mm": float(errors.max()),
-        "mean_rotation_error_deg": float(angles.mean()),
     }
     return indices, from_true, facts
 
@@ -256,7 +251,15 @@ class C3VDEndoGSLAMDataManager(RecordedDataManager):
     @classmethod
     @override
     def recognise(cls, path: Path) -> str | None:
-        return _recognised(path)
+        images = any(re.fullmatch(r"\d+_color", image.stem) for image in path.glob("color/*.png"))
+        poses = path / "pose.txt"
+        if images and _params(path, None) is not None:
+            return "color/NNNN_color.png and a params.npz"
+        if images and poses.is_file() and count_first_numbers(poses) == 16:
+            return "pose.txt (16 numbers a line) beside color/NNNN_color.png"
+        if not images and (beside := _release(path)):
+            return f"{beside[0].parent.name}{OPTIMIZED}/ beside {beside[0].parent.name}/"
+        return None
 
     @override
     def open(self, path: Path) -> Recording:
@@ -272,49 +275,40 @@ class C3VDEndoGSLAMDataManager(RecordedDataManager):
             **poses.facts,
             "intrinsics_from": "EndoGSLAM's table" if files.params is None else str(files.params),
             "depth_step_mm": None if depth_format is None else depth_format.size,
-            **rectification.facts(),
         }
         shots = make_shots(files.images, rectification, poses.camera_to_world, files.depths, depth_format)
-        test_sets, seen_masks = {}, {"video": find_seen_masks(folder / "truth", len(shots))}
+        test_sets = {}
         if (folder / ROTATION).is_dir():
             test_sets[ROTATION] = self._rotation(folder / ROTATION, rectification, poses)
-            seen_masks[ROTATION] = find_seen_masks(folder / ROTATION, len(test_sets[ROTATION]))
-        points_source = files.cloud or (files.params if params is not None and len(params.means) else None)
         return Recording(
+            folder=folder,
             kind=f"{facts['layout']} layout, {self.settings.poses} poses",
             shots=shots,
             facts=facts,
-            fingerprint=fingerprint(
-                folder, (*files.images, *(files.depths or ()), files.cloud), (files.poses, files.params)
-            ),
+            described_by=(files.poses, files.params),
             test_sets=test_sets,
-            own_points=None if points_source is None else lambda: _map_points(files.cloud, params, poses),
-            points_source=points_source or folder / PARAMS,
-            seen=seen_masks,
+            points_source=files.cloud or files.params or folder / PARAMS,
+            read_points=partial(_map_points, params, poses)
+            if params is not None and (files.cloud or len(params.means))
+            else None,
         )
 
     def _rectification(self, files: PreparedFiles, params: EndoGslamParams | None) -> Rectification:
-        width, height = size_of(files.images[0])
         calibrated, described_by = PREPARED_PINHOLE, "EndoGSLAM's calibration"
         if params is not None and files.params is not None:
             calibrated, described_by = params.intrinsics, str(files.params)
-        if abs((width / height) / (calibrated.width / calibrated.height) - 1.0) > ASPECT_TOLERANCE:
-            raise InputError(
-                f"{files.images[0]} is {width} x {height}, but {described_by} is for "
-                f"{calibrated.width} x {calibrated.height}",
-                "images of that size, or scaled from it",
-                "Give the params.npz that was made from these images",
-            )
-        pinhole = calibrated.resized(width, height)
-        off_middle = max(abs(pinhole.cx / width - 0.5), abs(pinhole.cy / height - 0.5))
+        do = "Give the params.npz that was made from these images"
+        lens = whole_frame(PinholeLens.of(calibrated), files.images[0], described_by, do)
+        pinhole = lens.pinhole
+        off_middle = max(abs(pinhole.cx / lens.width - 0.5), abs(pinhole.cy / lens.height - 0.5))
         if off_middle > MIDDLE_TOLERANCE:
             raise InputError(
                 f"{described_by}: the principal point ({pinhole.cx:g}, {pinhole.cy:g}) is {100 * off_middle:.0f} % of "
-                f"the image ({width} x {height}) from its middle",
+                f"the image ({lens.width} x {lens.height}) from its middle",
                 "intrinsics of the size that org_width and org_height say",
                 "They are of another resolution: correct org_width and org_height, or the intrinsics",
             )
-        return self.rectification_of(PinholeLens.of(pinhole), files.images[0])
+        return self.rectification_of(lens, files.images[0])
 
     def _rotation(self, folder: Path, rectification: Rectification, poses: SequencePoses) -> list[Shot]:
         files = _find_sequence(folder, None)
@@ -336,33 +330,18 @@ def _depth_format(files: PreparedFiles) -> ScaledDepth | None:
     return PREPARED_DEPTH if decode_image(files.depths[0]).dtype == np.uint8 else C3VD_DEPTH
 
 
-def _map_points(cloud: Path | None, params: EndoGslamParams | None, poses: SequencePoses) -> PointCloud:
-    """Points of EndoGSLAM's map in the world of the poses."""
-    if cloud is not None:
+def _map_points(params: EndoGslamParams, poses: SequencePoses, source: Path) -> PointCloud:
+    """Points of EndoGSLAM's map, a PLY file or params.npz, in the world of the poses."""
+    positions, shares = params.means, params.rgb_colors
+    if source.suffix == ".ply":
         names = tuple(f"f_dc_{channel}" for channel in range(3))
-        vertices = read_vertices(cloud, ("x", "y", "z", *names))
+        vertices = read_vertices(source, ("x", "y", "z", *names))
         positions = np.stack([vertices[axis] for axis in "xyz"], axis=1).astype(np.float64)
         shares = SH0 * np.stack([vertices[name] for name in names], axis=1) + 0.5
-    else:
-        assert params is not None
-        positions, shares = params.means, params.rgb_colors
     colors = np.rint(255.0 * np.clip(np.nan_to_num(shares), 0.0, 1.0)).astype(np.uint8)
     if poses.from_slam is not None:
         positions = positions @ poses.from_slam[:3, :3].T + poses.from_slam[:3, 3]
     return PointCloud(torch.from_numpy(positions.astype(np.float32)), torch.from_numpy(colors))
-
-
-def _recognised(folder: Path) -> str | None:
-    """The files that identify such a sequence or the folder of PR-Endo's release; None otherwise."""
-    images = any(re.fullmatch(r"\d+_color", path.stem) for path in folder.glob("color/*.png"))
-    poses = folder / "pose.txt"
-    if images and _params(folder, None) is not None:
-        return "color/NNNN_color.png and a params.npz"
-    if images and poses.is_file() and c3vd_poses.recognise(poses):
-        return "pose.txt (16 numbers a line) beside color/NNNN_color.png"
-    if not images and (beside := _release(folder)):
-        return f"{beside[0].parent.name}{OPTIMIZED}/ beside {beside[0].parent.name}/"
-    return None
 
 
 def _scene_folder(path: Path) -> Path:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 from jaxtyping import Float, Int, UInt8
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, Field
 from typing_extensions import override
 
 from coliags_plugin.core import scene_files as reading
@@ -22,10 +22,10 @@ from coliags_plugin.core.json_files import read_json, read_number
 from coliags_plugin.core.scene_files import FACTORS, Unit, read_unit
 from coliags_plugin.core.scenes import PointCloud, SparseDepth
 from coliags_plugin.core.settings import read_validated
-from coliags_plugin.datamanagers.reading.depth import DepthFormat, InverseDepth, ScaledDepth
-from coliags_plugin.datamanagers.recorded import RecordedDataManager, Recording, find_seen_masks, fingerprint
+from coliags_plugin.datamanagers.reading.images import DepthFormat, InverseDepth, ScaledDepth
+from coliags_plugin.datamanagers.recorded import RecordedDataManager, Recording
 from coliags_plugin.datamanagers.scene_settings import InitialPoints, SceneSettings
-from coliags_plugin.datamanagers.shots import Rectification, Shot, rectifications
+from coliags_plugin.datamanagers.shots import Rectification, Shot
 from coliags_plugin.geometry.lenses.models import Array, MappedLens, PinholeLens
 from coliags_plugin.geometry.poses import colmap as colmap_poses
 
@@ -163,14 +163,9 @@ def _lens(camera: colmap_poses.ColmapCamera, file: Path) -> ColmapLens:
 
 #: Name of the file, in the scene's folder.
 ATLAS_FILE = "atlas.json"
-_ATLAS_EXPECTED = "what `coliags poses sfm` wrote"
 
 
-class _Part(BaseModel):
-    model_config = ConfigDict(extra="ignore", frozen=True)
-
-
-class AtlasStretch(_Part):
+class AtlasStretch(BaseModel):
     """Frames, by number, of one model between two places at which few points are seen from both sides."""
 
     model: str  # folder of the model, relative to the scene
@@ -178,7 +173,7 @@ class AtlasStretch(_Part):
     frames: list[int]
 
 
-class AtlasJoin(_Part):
+class AtlasJoin(BaseModel):
     """A place between two stretches."""
 
     after: int  # last frame before it
@@ -186,14 +181,14 @@ class AtlasJoin(_Part):
     reason: str
 
 
-class LostFrame(_Part):
+class LostFrame(BaseModel):
     """A frame without a pose."""
 
     frame: int
     reason: str
 
 
-class AtlasRecord(_Part):
+class AtlasRecord(BaseModel):
     """Models of the frames of a video, and the reasons why others have no pose."""
 
     frames: list[str]  # names of the images in order: frames are numbered from 0
@@ -207,7 +202,7 @@ def read_atlas(scene: Path) -> AtlasRecord | None:
     file = scene / ATLAS_FILE
     if not file.is_file():
         return None
-    return read_validated(AtlasRecord, file, _ATLAS_EXPECTED)
+    return read_validated(AtlasRecord, file, "what `coliags poses sfm` wrote")
 
 
 def model_unit(scene: Path, model: Path, atlas: AtlasRecord | None) -> Unit:
@@ -293,24 +288,23 @@ class ColmapDataManager(RecordedDataManager):
         atlas = read_atlas(path)
         unit = settings.unit or model_unit(path, model.folder, atlas)
         depths, forms, params = self._depths(path, model, unit)
-        lenses = {
-            number: PinholeLens.of(lens.pinhole) if lens.model in PINHOLES else lens
+        rectifications = {
+            number: self.rectification_of(
+                PinholeLens.of(lens.pinhole) if lens.model in PINHOLES else lens, model.files[0]
+            )
             for number, lens in model.cameras.items()
         }
-        rectification_of = rectifications(lenses, model.files[0], self.working_size, settings.focal_scale)
         names = reading.short_names([image.name for image in model.images])
         others = reading.unposed_images(paths, (*masks, *depths))
         if atlas is None:  # else it says why images have no pose, or which other model has one
             reading.warn_of_unposed(model.files[1], others)
-        seen_masks = find_seen_masks(path / "truth", len(paths), complete=not others)
-        shots, used, misplaced = [], 0, 0
+        shots, misplaced = [], 0
         for index, image in enumerate(model.images):
             camera_to_world = model.camera_to_world[index].copy()
             camera_to_world[:3, 3] *= settings.scale
-            rectification, depth = rectification_of[image.camera], depths[index]
+            rectification, depth = rectifications[image.camera], depths[index]
             sparse, off = self._sparse_depth(model, image, camera_to_world, rectification)
             misplaced += off
-            used += 0 if sparse is None else len(sparse.depth)
             shots.append(
                 Shot(
                     names[index],
@@ -329,29 +323,23 @@ class ColmapDataManager(RecordedDataManager):
             "model": str(model.folder),
             "unit": unit,
             "lens": ", ".join(kinds),
-            "focal_scale": settings.focal_scale if set(kinds) - PINHOLES else None,
-            "cameras": len(rectification_of),
-            **next(iter(rectification_of.values())).facts(),
-            "scale": settings.scale,
-            "sparse_points": len(model.positions),
             "observations": sum(len(image.points) for image in model.images),
             "misplaced_observations": misplaced,
-            "sparse_depths": used,
-            "masks": sum(mask is not None for mask in masks),
         }
 
-        def own_points() -> PointCloud:
+        def points(_: Path) -> PointCloud:
             positions = (model.positions * settings.scale).astype(np.float32)
             return PointCloud(torch.from_numpy(positions), torch.from_numpy(model.colors))
 
         return Recording(
+            folder=path,
             kind=f"COLMAP model {model.folder}, {len(model.positions)} points, cameras {', '.join(kinds)}",
             shots=shots,
             facts=facts,
-            fingerprint=fingerprint(path, [*paths, *masks, *depths], [*model.files, params]),
-            own_points=own_points if len(model.positions) else None,
+            described_by=(*model.files, params),
             points_source=model.files[-1],
-            seen={"video": seen_masks},
+            read_points=points if len(model.positions) else None,
+            is_complete=not others,
             made_from={"points": [index for index, image in enumerate(model.images) if len(image.points)]},
         )
 
@@ -377,7 +365,7 @@ class ColmapDataManager(RecordedDataManager):
 
     def _depths(
         self, path: Path, model: SparseModel, unit: Unit
-    ) -> tuple[list[Path | None], Sequence[DepthFormat | None], Path | None]:
+    ) -> tuple[Sequence[Path | None], Sequence[DepthFormat | None], Path | None]:
         """Depth files of all images or of none, their formats, and the file of scales and offsets of inverse depth.
 
         Without such a file, depth is in the unit that the options or the scene state.
@@ -390,7 +378,7 @@ class ColmapDataManager(RecordedDataManager):
             return [None] * len(model.images), [None] * len(model.images), None
         suffixes = (".png",) if is_inverse else _DEPTH_SUFFIXES
         depths = reading.sidecar_files(folder, [image.name for image in model.images], suffixes)
-        files = reading.for_all(depths, folder, f"a file NAME{', NAME'.join(suffixes)}", or_none=False)
+        files = reading.for_every(depths, folder, f"a file NAME{', NAME'.join(suffixes)}")
         if is_inverse and depth_unit is not None:
             raise InputError(
                 f"the option depth_unit = {depth_unit:g}, but {params}, by which depths/ holds inverse depth",
@@ -448,16 +436,10 @@ def _image_paths(folder: Path, model: SparseModel, outside: bool) -> list[Path]:
             "the images that the model was made from",
             "Name it with `datamanager.images_folder=FOLDER`",
         )
-    paths = [reading.named_file(folder, image.name, str(model.folder), outside) for image in model.images]
-    missing = [path for path in paths if not path.is_file()]
-    if missing:
-        named = reading.first_few([path.name for path in missing])
-        raise InputError(
-            f"{len(missing)} of the {len(paths)} images of {model.folder} are not in {folder}: {named}",
-            "every registered image, under the name the model has for it",
-            "Restore them, or `datamanager.images_folder=FOLDER`",
-        )
-    return paths
+    paths = {image.name: reading.named_file(folder, image.name, str(model.folder), outside) for image in model.images}
+    return reading.for_every(
+        {name: path if path.is_file() else None for name, path in paths.items()}, folder, "an image"
+    )
 
 
 def _masks(scene: Path, model: SparseModel) -> list[Path | None]:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import logging
 import posixpath
-from collections.abc import Callable, Sequence
-from functools import cache
+from collections.abc import Sequence
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -25,13 +25,11 @@ from coliags_plugin.core.ply import point_properties, write_ply
 from coliags_plugin.core.scene_files import FACTORS, Unit, printed_unit
 from coliags_plugin.core.scenes import PointCloud
 from coliags_plugin.datamanagers.fusion import load_points
-from coliags_plugin.datamanagers.reading.depth import scaled_depth
-from coliags_plugin.datamanagers.reading.images import size_of
+from coliags_plugin.datamanagers.reading.images import scaled_depth, size_of
 from coliags_plugin.datamanagers.reading.transforms import PixelCenters, Transforms
-from coliags_plugin.datamanagers.recorded import RecordedDataManager, Recording, find_seen_masks, fingerprint
+from coliags_plugin.datamanagers.recorded import RecordedDataManager, Recording
 from coliags_plugin.datamanagers.scene_settings import POINTS_FILE, SceneSettings
-from coliags_plugin.datamanagers.shots import Shot, rectifications
-from coliags_plugin.geometry.lenses.models import PinholeLens
+from coliags_plugin.datamanagers.shots import Shot
 from coliags_plugin.geometry.poses.trajectory import FLIP_Y_AND_Z
 
 log = logging.getLogger(__name__)
@@ -53,17 +51,9 @@ class NerfstudioTransforms(Transforms):
         for name in self.names:
             candidates = (self.named(f"{name}{suffix}") for suffix in ("", *_IMAGE_SUFFIXES))
             paths[name] = next((path for path in candidates if path.is_file()), None)
-        missing = [name for name, path in paths.items() if path is None]
-        if missing:
-            folder, shown = self.path.parent, reading.first_few(missing)
-            raise InputError(
-                f"{self.path}: {len(missing)} of {len(paths)} frames have no image in {folder}: {shown}",
-                f"files of these names, with or without {', '.join(_IMAGE_SUFFIXES[:3])}",
-                "Restore them, or remove their frames",
-            )
-        return [path for path in paths.values() if path is not None]
+        return reading.for_every(paths, self.path, f"an image in {self.path.parent}")
 
-    def masks(self) -> list[Path | None]:
+    def masks(self) -> Sequence[Path | None]:
         """The masks of any of the frames; warns of other keys that may mean masks."""
         others = {key for frame in self.frames for key in frame} - {"mask_path"} | set(self.content)
         if ignored := sorted(key for key in others if "mask" in key.lower()):
@@ -106,7 +96,7 @@ class NerfstudioTransforms(Transforms):
         listed = self.content.get(ESTIMATED_FROM)
         return {} if listed is None else {"depth": self._indices(ESTIMATED_FROM, listed)}
 
-    def depths(self, option: float | None) -> tuple[list[Path | None], float | None]:
+    def depths(self, option: float | None) -> tuple[Sequence[Path | None], float | None]:
         """Depth files of all frames or of none, and world units before applied_scale per stored unit; None: not said.
 
         The keys of instant-ngp are read where no frame has nerfstudio's. ``option``: an option that replaces the unit.
@@ -203,30 +193,21 @@ class NerfstudioDataManager(RecordedDataManager):
         images, masks = transforms.images(), transforms.masks()
         depths, depth_step = transforms.depths(settings.depth_unit_scale_factor)
         confidences = transforms.files("confidence_file_path", for_every=True)
-        if any(confidences) and not any(depths):
-            raise InputError(
-                f"{file}: the frames have a confidence_file_path, but no depth_file_path",
-                "confidence beside the depth that it is about",
-                "Add depth_file_path, or remove confidence_file_path",
-            )
         # Without a size in the file, all images must have the size of the first.
         lenses = transforms.lenses(settings.pixel_centers, cache(lambda: size_of(images[0])))
         camera_to_world = trajectory.camera_to_world.copy()
         camera_to_world[:, :3, 3] *= settings.scale
         unit = self.stated_unit(path)
         depth_unit = self._depth_unit(depth_step, unit, file if any(depths) else None)
-        rectification_of = rectifications(
-            {lens: lens for lens in lenses}, file, self.working_size, settings.focal_scale
-        )
+        rectifications = {lens: self.rectification_of(lens, file) for lens in dict.fromkeys(lenses)}
         others = [path for of_frame in zip(depths, masks, confidences, strict=True) for path in of_frame]
         unposed = reading.unposed_images(images, others)
         reading.warn_of_unposed(file, unposed)
-        seen_masks = find_seen_masks(path / "truth", len(images), complete=not unposed)
         shots = [
             Shot(
                 short,
                 images[index],
-                rectification_of[lenses[index]],
+                rectifications[lenses[index]],
                 camera_to_world[index],
                 depth,
                 None if depth is None else scaled_depth(depth, depth_unit),
@@ -236,34 +217,27 @@ class NerfstudioDataManager(RecordedDataManager):
             for index, (short, depth) in enumerate(zip(reading.short_names(transforms.names), depths, strict=True))
         ]
         kinds = sorted({type(lens).__name__ for lens in lenses})
-        bent = not all(isinstance(lens, PinholeLens) for lens in lenses)
         facts: dict[str, Any] = {
             "layout": "nerfstudio",
             "lens": ", ".join(kinds),
-            "focal_scale": settings.focal_scale if bent else None,
-            "cameras": len(rectification_of),
-            **next(iter(rectification_of.values())).facts(),
-            "scale": settings.scale,
             "depth_unit": depth_unit if shots[0].depth is not None else None,
-            "depth_is_estimated": shots[0].confidence is not None,
-            "pixel_centers_in_file": settings.pixel_centers,
             "pose_convention": {
                 "stored_as": trajectory.stored_as,
                 "remarks": [remark for remark in trajectory.remarks if not remark.startswith("no ")],
             },
-            "masks": sum(mask is not None for mask in masks),
         }
-        own_points, source = self._own_points(path, transforms)
+        source = transforms.points_file()
         return Recording(
+            folder=path,
             kind=f"nerfstudio, {trajectory.summary(printed_unit(unit))}",
             shots=shots,
             facts=facts,
-            fingerprint=fingerprint(path, [*images, *others], [file]),
+            described_by=(file,),
             own_split=transforms.split(),
             made_from=transforms.made_from(),
-            own_points=own_points,
-            points_source=source,
-            seen={"video": seen_masks},
+            points_source=source or path / POINTS_FILE,
+            read_points=load_points if source is None else partial(self._points, transforms),
+            is_complete=not unposed,
         )
 
     def _depth_unit(self, step: float | None, unit: Unit, file: Path | None) -> float:
@@ -282,21 +256,11 @@ class NerfstudioDataManager(RecordedDataManager):
             )
         return (step or _DEPTH_STEP) * self.settings.scale
 
-    def _own_points(
-        self, path: Path, transforms: NerfstudioTransforms
-    ) -> tuple[Callable[[], PointCloud] | None, Path | None]:
-        """Points of ``ply_file_path`` (in the file's world), or else of ``points3D.ply`` (in the scene's world)."""
-        file = transforms.points_file()
-        if file is None:
-            beside = path / POINTS_FILE
-            return ((lambda: load_points(beside)), beside) if beside.is_file() else (None, None)
-
-        def points() -> PointCloud:
-            cloud = load_points(file)
-            positions = transforms.undo_applied_transform(cloud.positions.double().numpy()) * self.settings.scale
-            return PointCloud(torch.from_numpy(positions).float(), cloud.colors)
-
-        return points, file
+    def _points(self, transforms: NerfstudioTransforms, file: Path) -> PointCloud:
+        """Points of ``ply_file_path``, which are in the file's world."""
+        cloud = load_points(file)
+        positions = transforms.undo_applied_transform(cloud.positions.double().numpy()) * self.settings.scale
+        return PointCloud(torch.from_numpy(positions).float(), cloud.colors)
 
 
 _POINTS = "points.ply"

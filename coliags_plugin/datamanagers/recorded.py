@@ -6,9 +6,9 @@ import hashlib
 import logging
 import shlex
 from abc import abstractmethod
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
-from functools import partial
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import chain
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -38,8 +38,8 @@ from coliags_plugin.core.scenes import Frame, PointCloud, Scene
 from coliags_plugin.core.splits import Split, divide
 from coliags_plugin.datamanagers.fusion import fuse_depth, load_points, subsampled
 from coliags_plugin.datamanagers.scene_settings import POINTS_FILE, SceneSettings
-from coliags_plugin.datamanagers.shots import PAPER_SIZE, Rectification, Shot, StoredPixels, fitted, rectifications
-from coliags_plugin.geometry.lenses.models import Lens
+from coliags_plugin.datamanagers.shots import PAPER_SIZE, Rectification, Shot, StoredPixels, fitted
+from coliags_plugin.geometry.lenses.models import Lens, PinholeLens
 from coliags_plugin.geometry.poses.c3vd import C3vdPoses, read_poses
 
 log = logging.getLogger(__name__)
@@ -49,39 +49,42 @@ log = logging.getLogger(__name__)
 class Recording:
     """A posed video on disk."""
 
+    folder: Path
     kind: str  # dataset and layout, for the log
     shots: Sequence[Shot]  # frames in video order
-    facts: Mapping[str, Any]  # provenance: layout, lens, sizes, pose convention and so on
-    fingerprint: str  # hash of the files; see :func:`fingerprint`
+    facts: Mapping[str, Any]  # provenance: layout, lens, pose convention, and what the format adds
+    described_by: Sequence[Path | None]  # files of poses and cameras
     test_sets: Mapping[str, Sequence[Shot]] = field(default_factory=dict)  # the dataset's separate ones, by name
     own_split: Mapping[str, Sequence[int]] | None = None  # the dataset's: "train" and "test" indices into ``shots``
-    own_points: Callable[[], PointCloud] | None = None  # reads the dataset's initial points; None where there are none
-    points_source: Path | None = None  # the file or folder of these points
-    #: Seen masks by frame index: of ``shots`` under "video", and of test sets by their names.
-    seen: Mapping[str, Mapping[int, Path]] = field(default_factory=dict)
+    points_source: Path | None = None  # the dataset's initial points, if the file is there
+    read_points: Callable[[Path], PointCloud] | None = load_points  # None where the file has none
+    is_complete: bool = True  # whether the frames are all images of the dataset
     #: Indices into ``shots`` of the images that "depth", or "points" with their depth, were made from, where known.
     made_from: Mapping[str, Collection[int]] = field(default_factory=dict)
+
+    @property
+    def fingerprint(self) -> str:
+        """SHA-256 of the names and sizes of the frames' files and the contents of those of poses and cameras."""
+        digest = hashlib.sha256()
+        try:
+            for part in ("image", "depth", "mask", "confidence"):
+                for path in filter(None, (getattr(shot, part) for shot in self.shots)):
+                    named = f"{portable_name(path, self.folder)} {path.stat().st_size}\n"
+                    digest.update(named.encode("utf-8", "surrogateescape"))
+            for path in filter(None, self.described_by):
+                with path.open("rb") as file:
+                    while block := file.read(1 << 20):
+                        digest.update(block)
+        except OSError as error:
+            raise InputError(
+                f"cannot read {path}: {error.strerror or error}", "a readable file", "Restore it"
+            ) from error
+        return digest.hexdigest()
 
 
 def portable_name(path: Path, folder: Path) -> str:
     """Path relative to a scene's folder, or the file name alone outside of it: no path of this machine."""
     return path.relative_to(folder).as_posix() if path.is_relative_to(folder) else path.name
-
-
-def fingerprint(folder: Path, large: Iterable[Path | None], small: Iterable[Path | None]) -> str:
-    """SHA-256 of the names and sizes of large files and the contents of small ones."""
-    digest = hashlib.sha256()
-    try:
-        for path in filter(None, large):
-            named = f"{portable_name(path, folder)} {path.stat().st_size}\n"
-            digest.update(named.encode("utf-8", "surrogateescape"))
-        for path in filter(None, small):
-            with path.open("rb") as file:
-                while block := file.read(1 << 20):
-                    digest.update(block)
-    except OSError as error:
-        raise InputError(f"cannot read {path}: {error.strerror or error}", "a readable file", "Restore it") from error
-    return digest.hexdigest()
 
 
 def poses_of_images(file: Path, images: int) -> C3vdPoses:
@@ -100,20 +103,8 @@ def poses_of_images(file: Path, images: int) -> C3vdPoses:
 ROTATION = "rotation"
 
 
-def find_seen_masks(path: Path, count: int, complete: bool = True) -> dict[int, Path]:
-    """Seen masks ``seen/NNNN_seen.png`` in ``path``, by frame index.
-
-    ``complete`` tells whether the frames are all images of the dataset. Masks are numbered by image, so that they do
-    not match frames where images are left out.
-    """
-    folder = path / "seen"
-    if not complete:
-        if folder.is_dir():
-            log.warning(
-                "%s: seen masks are for all images, but some are left out, so metrics on seen pixels are unavailable",
-                folder,
-            )
-        return {}
+def _numbered_masks(folder: Path, count: int) -> dict[int, Path]:
+    """Masks ``NNNN_seen.png`` by frame index."""
     masks = numbered(folder, "seen", frozenset({".png"}))
     for index, mask in masks.items():
         if index >= count:
@@ -136,18 +127,17 @@ class RecordedDataManager(DataManager):
     name: ClassVar[str]
     #: Default bounds of the working width and height, pixels: the published size of the dataset, or else the paper's
     #: (docs/data.md 2). None: the stored size.
-    fits: ClassVar[tuple[int, int] | None] = PAPER_SIZE
+    fits: tuple[int, int] | None = PAPER_SIZE
+    #: Where the folder ``seen`` of the seen masks of the video, and of a test set by its name, is.
+    seen_in: ClassVar[Mapping[str, str]] = {"video": "truth", ROTATION: ROTATION}
     #: The split whose training frames the dataset's seen masks refer to (docs/layouts/c3vd.md 5).
     seen_split: ClassVar[Split] = "every-8th"
     #: Where the format has masks, for messages.
     masks_at: ClassVar[str] = "no files"
     #: Unit of length of the dataset's files, where a scene states none.
     unit: ClassVar[Unit] = "mm"
-
-    def __init__(self, settings: Any) -> None:
-        super().__init__(settings)
-        self._bounds = self.fits
-        self._is_told = True  # in the log, what is read
+    #: Whether the log tells what is read.
+    is_told = True
 
     @abstractmethod
     def open(self, path: Path) -> Recording:
@@ -168,24 +158,28 @@ class RecordedDataManager(DataManager):
 
     def working_size(self, width: int, height: int) -> tuple[int, int]:
         """Working size for a stored size, pixels: the configured size, or the largest within :attr:`fits`."""
-        return self.settings.size or fitted(width, height, self._bounds)
+        return self.settings.size or fitted(width, height, self.fits)
 
     def rectification_of(
         self, lens: Lens, described_by: Path, shows: Bool[np.ndarray, "H W"] | None = None
     ) -> Rectification:
-        """The rectification of images of one lens; arguments as for :func:`rectifications`."""
-        focal_scale = self.settings.focal_scale
-        rectification = rectifications({0: lens}, described_by, self.working_size, focal_scale, shows)[0]
-        if rectification.undistortion is not None:
-            rectification.undistortion()  # once, before images are read in parallel
-        return rectification
+        """The rectification of images from a lens, at the size of the stored images, which ``described_by`` states.
+
+        Images of others than pinholes are undistorted to their nominal pinhole, its focal length times
+        ``focal_scale``. ``shows`` are the stored pixels with image content.
+        """
+        pinhole = lens.resized(*self.working_size(lens.width, lens.height)).pinhole
+        if not isinstance(lens, PinholeLens):
+            factor = self.settings.focal_scale
+            pinhole = replace(pinhole, fx=pinhole.fx * factor, fy=pinhole.fy * factor)
+        return Rectification(lens, pinhole, described_by, shows)
 
     @override
     def at_stored_size(self) -> DataManager:
         changes = {"width": None, "height": None, "keep_pixels": False, "initial_points": "none"}
         manager = type(self)(self.settings.model_copy(update=changes))
-        manager._bounds = None
-        manager._is_told = False  # again
+        manager.fits = None
+        manager.is_told = False  # again
         return manager
 
     def load(self, path: Path, progress: Progress | None = None) -> Scene:
@@ -195,18 +189,22 @@ class RecordedDataManager(DataManager):
         """
         path, settings = Path(path), self.settings
         recording = self.open(path)
+        if any(shot.confidence is not None and shot.depth is None for shot in recording.shots):
+            raise InputError(
+                f"{path} has confidence in depth, but no depth",
+                "confidence beside the depth that it is about",
+                "Add the depth, or leave the confidence out",
+            )
         train_indices, test_indices = self._split(recording, path)
-        seen_masks = self._valid_seen_masks(recording, train_indices, test_indices, path)
+        seen = self._seen_masks(recording, train_indices, bool(test_indices))
         train = self._frames(recording.shots, train_indices, {})
-        test_sets = (
-            {"test": self._frames(recording.shots, test_indices, seen_masks.get("video", {}))} if test_indices else {}
-        )
+        test_sets = {"test": self._frames(recording.shots, test_indices, seen.get("video", {}))} if test_indices else {}
         for name, shots in recording.test_sets.items():
-            test_sets[name] = self._frames(shots, range(len(shots)), seen_masks.get(name, {}))
-        video = sorted([*train, *(test_sets["test"] if test_indices else [])], key=lambda frame: frame.index)
+            test_sets[name] = self._frames(shots, range(len(shots)), seen.get(name, {}))
+        _ = recording.shots[0].rectification.undistortion  # made once, before images are read in parallel
         if settings.keep_pixels:
-            others = (frame for name in recording.test_sets for frame in test_sets[name])
-            stored = [frame.source for frame in (*video, *others) if isinstance(frame.source, StoredPixels)]
+            frames = sorted(chain(train, *test_sets.values()), key=lambda frame: frame.index)
+            stored = [frame.source for frame in frames if isinstance(frame.source, StoredPixels)]
             parallel_map(StoredPixels.preload, stored, "read images", progress)
         points, described = self._initial_points(recording, path, train, progress)
         split = SplitRecord(
@@ -222,6 +220,9 @@ class RecordedDataManager(DataManager):
         used = _held_out_used(recording, test_indices)
         facts: JsonObject = {
             "dataset": self.name,
+            **recording.shots[0].rectification.facts(),
+            "masks": sum(shot.mask is not None for shot in recording.shots),
+            "depth_is_estimated": any(shot.confidence is not None for shot in recording.shots),
             **recording.facts,
             "unit": unit if unit == "unknown" else "mm",
             "fingerprint": recording.fingerprint,
@@ -229,21 +230,17 @@ class RecordedDataManager(DataManager):
             "points": described,
             **({"held_out_used": used} if used else {}),
             "frames": {"in_sequence": len(recording.shots), **counts},
-            "invalid_depth_share": _invalid_depth_share(video) if settings.keep_pixels else None,
         }
-        if self._is_told:
+        if self.is_told:
             self._tell(recording, path)
         folder = path.resolve()
         return Scene(folder.name, train, test_sets, points, Provenance(**facts), folder).scaled(FACTORS[unit])
 
     def _tell(self, recording: Recording, path: Path) -> None:
-        """Log what is read: doubts about it, sizes where images are downscaled by default, and the number of frames."""
+        """Log what is read: sizes where images are downscaled by default, and the number of frames."""
         rectifications = [shot.rectification for shot in recording.shots]
-        for doubt in dict.fromkeys(rectification.doubt() for rectification in rectifications):
-            if doubt is not None:
-                log.warning("%s", doubt)
         stored = sizes_text((each.lens.width, each.lens.height) for each in rectifications)
-        used = sizes_text((each.width, each.height) for each in rectifications)
+        used = sizes_text((each.pinhole.width, each.pinhole.height) for each in rectifications)
         if used != stored and self.settings.size is None:
             change = "`datamanager.width=W` and `datamanager.height=H` set another size"
             log.info("%s: images stored at %s are used at %s; %s", path, stored, used, change)
@@ -268,19 +265,22 @@ class RecordedDataManager(DataManager):
             what = first_few(sorted(names))
             log.warning("%s: %s not used: format %s reads %s as masks", path, what, self.name, self.masks_at)
 
-    def _valid_seen_masks(
-        self, recording: Recording, train: Sequence[int], test: Sequence[int], path: Path
+    def _seen_masks(
+        self, recording: Recording, train: Sequence[int], has_test: bool
     ) -> Mapping[str, Mapping[int, Path]]:
-        """The seen masks if the run trains on the frames they were made for; none else."""
+        """Seen masks by frame index, if the run trains on the frames they were made for; none else."""
+        parts = ({"video": recording.shots} if has_test else {}) | dict(recording.test_sets)
+        folders = {part: recording.folder / self.seen_in[part] / "seen" for part in parts if part in self.seen_in}
         intended, _ = divide(self.seen_split, range(len(recording.shots)), recording.own_split)
-        if set(intended) == set(train):
-            return recording.seen
-        if (test or recording.test_sets) and any(recording.seen.values()):
+        if recording.is_complete and set(intended) == set(train):
+            return {part: _numbered_masks(folder, len(parts[part])) for part, folder in folders.items()}
+        if any(folder.is_dir() for folder in folders.values()):
             log.warning(
-                "%s: seen masks are for split '%s' of all frames; this run trains on other frames, so metrics on seen "
-                "pixels are unavailable",
-                path,
-                self.seen_split,
+                "%s: seen masks are for %s, so metrics on seen pixels are unavailable",
+                recording.folder,
+                f"split '{self.seen_split}' of all frames; this run trains on other frames"
+                if recording.is_complete
+                else "all images, but some are left out",  # they are numbered by image
             )
         return {}
 
@@ -316,11 +316,12 @@ class RecordedDataManager(DataManager):
         if settings.initial_points == "none":
             return PointCloud(torch.zeros(0, 3)), PointsRecord(source="none", count=0)
         has_depth = any(shot.depth is not None for shot in recording.shots)
-        read_points, source = recording.own_points, recording.points_source
+        source, read_points = recording.points_source, recording.read_points
         if settings.initial_points == "file":
-            source = path / user_path(settings.points_file)
-            read_points = partial(load_points, source)
-        elif has_depth and (settings.initial_points == "depth" or read_points is None):
+            source, read_points = path / user_path(settings.points_file), load_points
+        elif source is None or not source.is_file():
+            read_points = None
+        if has_depth and (settings.initial_points == "depth" or read_points is None):
             points = fuse_depth(train, settings.points_count, generator, progress)
             return points, self._described_points("depth of the training frames", points, path)
         if read_points is None or source is None:
@@ -332,7 +333,7 @@ class RecordedDataManager(DataManager):
                 f"Estimate depth: coliags depth estimate {shlex.quote(str(path))} -o FOLDER; or put "
                 f"{missing} (world of the poses) there; or {from_file}",
             )
-        points = subsampled(read_points(), settings.points_count, generator, source)
+        points = subsampled(read_points(source), settings.points_count, generator, source)
         return points, self._described_points(source, points, path)
 
     def _described_points(self, source: Path | str, points: PointCloud, scene: Path) -> PointsRecord:
@@ -349,14 +350,3 @@ def _held_out_used(recording: Recording, test: Sequence[int]) -> dict[str, list[
         for what, indices in (sources | dict(recording.made_from)).items()
     }
     return {what: names for what, names in used.items() if test and (names is None or names)}
-
-
-def _invalid_depth_share(frames: Sequence[Frame]) -> float | None:
-    """Share of the unmasked pixels whose depth is unknown; None where there is no depth."""
-    shares = []
-    for frame in frames:
-        depth, mask = frame.depth, frame.mask
-        if depth is not None and (mask is None or mask.any()):
-            unknown = np.isnan(depth.numpy())
-            shares.append(unknown.mean() if mask is None else unknown[mask.numpy()].mean())
-    return float(np.mean(shares)) if shares else None

@@ -18,10 +18,9 @@ from coliags_plugin.core import scene_files as reading
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.json_files import image_size, read_json, read_number
 from coliags_plugin.core.splits import Split
-from coliags_plugin.datamanagers.reading.depth import DepthFormat
-from coliags_plugin.datamanagers.reading.images import read_gray, read_mask
+from coliags_plugin.datamanagers.reading.images import DepthFormat, read_gray, read_mask
 from coliags_plugin.datamanagers.reading.transforms import Transforms
-from coliags_plugin.datamanagers.recorded import RecordedDataManager, Recording, find_seen_masks, fingerprint
+from coliags_plugin.datamanagers.recorded import RecordedDataManager, Recording
 from coliags_plugin.datamanagers.scene_settings import SceneSettings
 from coliags_plugin.datamanagers.shots import make_shots
 from coliags_plugin.geometry.lenses.models import FisheyeLens, Lens
@@ -56,27 +55,15 @@ class RayDistance(DepthFormat):
         return read_gray(path, 16, "a one-channel 16-bit distance map")
 
     @override
-    def z_depth(self, stored: Shaped[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
-        depth = self._z(stored)
-        depth[(stored == 0) | self._is_clipped(stored, depth)] = np.nan
-        return depth
-
-    @override
-    def clipped_at(self, stored: Shaped[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"] | None:
-        depth = self._z(stored)
-        clipped = self._is_clipped(stored, depth)
-        if not clipped.any():
-            return None
-        return np.where(clipped, np.minimum(depth, np.float32(C3VD_RANGE)), np.float32(np.nan))
-
-    def _z(self, stored: Shaped[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
-        return np.asarray(stored.astype(np.float32) * np.float32(self.size) * self.cosine)
-
-    def _is_clipped(
-        self, stored: Shaped[np.ndarray, "h w"], depth: Float32[np.ndarray, "h w"]
-    ) -> Bool[np.ndarray, "h w"]:
-        """Pixels clipped in the distance map or in the original depth, with one step for rounding."""
-        return np.asarray((stored == 65535) | (depth >= C3VD_RANGE - self.size))
+    def decode(
+        self, stored: Shaped[np.ndarray, "h w"]
+    ) -> tuple[Float32[np.ndarray, "h w"], Float32[np.ndarray, "h w"] | None]:
+        depth = np.asarray(stored.astype(np.float32) * np.float32(self.size) * self.cosine)
+        # In the distance map or in the original depth, with one step for rounding.
+        clipped = (stored == 65535) | (depth >= C3VD_RANGE - self.size)
+        bound = np.where(clipped, np.minimum(depth, np.float32(C3VD_RANGE)), np.float32(np.nan))
+        depth[(stored == 0) | clipped] = np.nan
+        return depth, bound if clipped.any() else None
 
 
 class ReimNerfDataSettings(SceneSettings):
@@ -160,13 +147,10 @@ class ReimNerfDataManager(RecordedDataManager):
         images, poses = [frames[name][0] for name in names], np.stack([frames[name][2] for name in names])
         shots = make_shots(images, rectification, poses, distances, form)
         reading.warn_of_unposed(path, reading.unposed_images(images, distances))
-        large = [file for pair in zip(images, distances, strict=True) for file in pair]
         facts: dict[str, Any] = {
             "layout": "REIM-NeRF",
             "lens": "fisheye of the JSON files",
-            "focal_scale": settings.focal_scale,
             "mask": MASK_FILE if settings.mask else None,
-            **rectification.facts(),
             "parts": {part: len(frames) for part, frames in indices.items()},
             "pose_convention": {
                 "order": "camera-to-world, OpenGL axes, normalised",
@@ -175,12 +159,12 @@ class ReimNerfDataManager(RecordedDataManager):
             },
         }
         return Recording(
+            folder=path,
             kind=f"REIM-NeRF layout, {'no mask' if mask is None else f'all masked by {MASK_FILE}'}",
             shots=shots,
             facts=facts,
-            fingerprint=fingerprint(path, large, (*files.values(), mask)),
+            described_by=(*files.values(), mask),
             own_split={"train": indices["train"], "test": indices.get("true_test", ())},
-            seen={"video": find_seen_masks(path / "truth", len(frames))},
         )
 
 

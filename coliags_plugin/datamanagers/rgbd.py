@@ -5,8 +5,6 @@ from __future__ import annotations
 import logging
 import re
 from collections.abc import Sequence
-from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
@@ -22,9 +20,8 @@ from coliags_plugin.core.scene_files import printed_unit
 from coliags_plugin.core.scenes import PointCloud
 from coliags_plugin.core.text_files import read_text, shortened
 from coliags_plugin.datamanagers.fusion import load_points
-from coliags_plugin.datamanagers.reading.depth import ScaledDepth
-from coliags_plugin.datamanagers.reading.images import size_of
-from coliags_plugin.datamanagers.recorded import RecordedDataManager, Recording, find_seen_masks, fingerprint
+from coliags_plugin.datamanagers.reading.images import ScaledDepth, size_of
+from coliags_plugin.datamanagers.recorded import RecordedDataManager, Recording
 from coliags_plugin.datamanagers.scene_settings import POINTS_FILE, SceneSettings
 from coliags_plugin.datamanagers.shots import make_shots
 from coliags_plugin.geometry.lenses.models import Lens, PinholeLens
@@ -33,6 +30,7 @@ from coliags_plugin.geometry.meshes.mesh import read_mesh
 from coliags_plugin.geometry.poses import tum
 from coliags_plugin.geometry.poses.alignment import nearest_in_time
 from coliags_plugin.geometry.poses.colmap import read_pinholes
+from coliags_plugin.geometry.poses.formats import count_first_numbers
 from coliags_plugin.geometry.poses.trajectory import Trajectory, natural_order
 
 log = logging.getLogger(__name__)
@@ -102,7 +100,7 @@ class RGBDDataManager(RecordedDataManager):
     def recognise(cls, path: Path) -> str | None:
         calibrated = not any((path / name).is_file() for name in CAMERA_FILES) and bool(calibration_files(path))
         images = next((name for name in IMAGE_FOLDERS if (path / name).is_dir()), None)
-        trajectory = next((file for file in _trajectories(path) if tum.recognise(file)), None)
+        trajectory = next((file for file in _trajectories(path) if count_first_numbers(file) == 8), None)
         if images is None or trajectory is None or calibrated != cls.is_calibrated:
             return None
         return f"the TUM trajectory {trajectory.name} beside {images}/"
@@ -128,34 +126,18 @@ class RGBDDataManager(RecordedDataManager):
         camera_file, lens, stated_scale = _find_camera(path, used[0])
         scale = self._depth_scale(stated_scale, camera_file) if depths else None
         rectification = self.rectification_of(lens, camera_file)
-        seen_masks = find_seen_masks(path / "truth", len(images), len(rows) == len(images) == len(trajectory))
         masks = _files_of_images(path, reading.MASK_FOLDERS, used, "mask")
         confidences = _files_of_images(path, CONFIDENCE_FOLDERS if is_metric else (), used, "confidence")
-        if any(confidences) and not depths:
-            raise InputError(
-                f"{path} holds confidence/, but no depth",
-                "confidence beside the depth that it is about",
-                "Add the depth, or move confidence/ away",
-            )
         depth_files, poses = [depth for _, depth, _ in rows], trajectory.camera_to_world[[pose for _, _, pose in rows]]
         form = None if scale is None else ScaledDepth(1.0 / scale)
-        shots = [
-            replace(shot, mask=mask, confidence=confidence)
-            for shot, mask, confidence in zip(
-                make_shots(used, rectification, poses, depth_files, form), masks, confidences, strict=True
-            )
-        ]
+        shots = make_shots(used, rectification, poses, depth_files, form, "", masks, confidences)
         facts: dict[str, Any] = {
             "layout": "TUM RGB-D",
             "trajectory": file.name,
             "intrinsics_from": camera_file.name,
             "lens": type(lens).__name__,
-            "focal_scale": None if isinstance(lens, PinholeLens) else settings.focal_scale,
             "depth_scale": scale,
             "association": association,
-            "masks": sum(mask is not None for mask in masks),
-            "depth_is_estimated": any(confidences),
-            **rectification.facts(),
             "pose_convention": {
                 "order": f"TUM: {trajectory.stored_as}",
                 "poses": len(trajectory),
@@ -164,17 +146,15 @@ class RGBDDataManager(RecordedDataManager):
         }
         meshes = list(path.glob("[!.]*.obj"))
         points = next((file for file in (path / POINTS_FILE, *meshes[: len(meshes) == 1]) if file.is_file()), None)
-        large = (*used, *depth_files, *masks, *confidences)
         return Recording(
+            folder=path,
             kind=f"TUM RGB-D, associated by {association['by']}",
             shots=shots,
             facts=facts,
-            fingerprint=fingerprint(path, large, (file, camera_file)),
-            own_points=None
-            if points is None
-            else partial(_read_mesh_points if points.suffix == ".obj" else load_points, points),
+            described_by=(file, camera_file),
             points_source=points,
-            seen={"video": seen_masks},
+            read_points=_read_mesh_points if points is not None and points.suffix == ".obj" else load_points,
+            is_complete=len(rows) == len(images) == len(trajectory),
         )
 
     def _is_by_time(self, images: Sequence[Path]) -> bool:
@@ -243,14 +223,9 @@ class RGBDDataManager(RecordedDataManager):
                 "Restore the missing ones, or `datamanager.association=time` if its timestamps name images",
             )
         self._check_times_say_the_same(numbered, trajectory, file)
-        if deep and deep.keys() != numbered.keys():
-            lone = min(deep.keys() ^ numbered.keys())
-            raise InputError(
-                f"{file.parent} has {len(numbered)} images and {len(deep)} depth files; frame "
-                f"{' '.join(map(str, lone))} has only one of the two",
-                "a depth file for every image, or none at all",
-                "Restore the missing files, or `datamanager.depth=none`",
-            )
+        do = "Restore the missing files, or `datamanager.depth=none`"
+        names, deep_names = ([" ".join(map(str, key)) for key in files] for files in (numbered, deep))
+        reading.same_frames(file.parent, names, deep_names, do)
         rows: list[_Row] = [(image, deep.get(key), pose) for pose, (key, image) in enumerate(numbered.items())]
         return rows, {"by": "order"}
 
@@ -325,7 +300,7 @@ def _find_depths(folder: Path) -> list[Path]:
     return depths
 
 
-def _files_of_images(folder: Path, names: Sequence[str], images: Sequence[Path], what: str) -> list[Path | None]:
+def _files_of_images(folder: Path, names: Sequence[str], images: Sequence[Path], what: str) -> Sequence[Path | None]:
     """Files of the stems of images, such as masks, where there is a folder of one of the ``names``, else None for each.
 
     The folder must have one for every image; ``what`` they are is for the error.
@@ -334,7 +309,7 @@ def _files_of_images(folder: Path, names: Sequence[str], images: Sequence[Path],
     if file_folder is None:
         return [None] * len(images)
     files = reading.sidecar_files(file_folder, [image.name for image in images], reading.MASK_SUFFIXES)
-    return reading.for_all(files, file_folder, f"a {what}", or_none=False)
+    return reading.for_every(files, file_folder, f"a {what}")
 
 
 def _find_trajectory(folder: Path, named: str | None) -> Path:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from pydantic import Field
@@ -13,14 +13,13 @@ from typing_extensions import override
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import user_path
-from coliags_plugin.core.scene_files import for_all, inventory, numbered, require_folder
+from coliags_plugin.core.scene_files import for_all, for_every, inventory, numbered, require_folder
 from coliags_plugin.core.scenes import PointCloud
 from coliags_plugin.core.splits import Split
 from coliags_plugin.datamanagers.fusion import load_points
-from coliags_plugin.datamanagers.reading.depth import ExrDepth
-from coliags_plugin.datamanagers.reading.images import size_of
+from coliags_plugin.datamanagers.reading.images import ExrDepth, size_of
 from coliags_plugin.datamanagers.reading.transforms import Transforms, camera_of
-from coliags_plugin.datamanagers.recorded import ROTATION, RecordedDataManager, Recording, find_seen_masks, fingerprint
+from coliags_plugin.datamanagers.recorded import ROTATION, RecordedDataManager, Recording
 from coliags_plugin.datamanagers.scene_settings import InitialPoints, SceneSettings
 from coliags_plugin.datamanagers.shots import Shot, make_shots
 
@@ -68,6 +67,7 @@ class RotateColonDataManager(RecordedDataManager):
     #: Published results use the stored size.
     fits = None
     seen_split = "all-train"
+    seen_in: ClassVar[Mapping[str, str]] = {_MAIN_SET: "truth", ROTATION: "truth"}
 
     @classmethod
     @override
@@ -79,8 +79,8 @@ class RotateColonDataManager(RecordedDataManager):
         require_folder(path, _LAYOUT)
         if self.recognise(path) is None:
             raise InputError(f"{path} holds {inventory(path)}", _LAYOUT, "Name the scene's own folder")
-        parts = [self._views(path / TRAIN, path / TRAIN_VIEWS, path / TRAIN_DEPTH)]
-        test = path / TEST
+        shots, facts = self._views(path / TRAIN, path / TRAIN_VIEWS, path / TRAIN_DEPTH)
+        test, parts, test_sets = path / TEST, [facts], {}
         if test.is_file():
             images = path / user_path(self.settings.test_folder)
             if not images.is_dir():
@@ -89,26 +89,20 @@ class RotateColonDataManager(RecordedDataManager):
                     "the images of the test views",
                     "Name the folder they are in with `datamanager.test_folder=FOLDER`",
                 )
-            parts.append(self._views(test, images, None, "test-"))
-        (shots, facts), *others = parts
-        complete = not any(part["images_without_pose"] for _, part in parts)
-        test_sets, seen_masks = {}, {}
-        name = _MAIN_SET if self.settings.split in ("all-train", "own") else ROTATION
-        for test_sets[name], facts[name] in others:
-            seen_masks[name] = find_seen_masks(path / "truth", len(test_sets[name]), complete)
-        points = path / POINTS
-        present_points = points if points.is_file() else None
-        pixels = (file for views, _ in parts for file in (*[v.image for v in views], *[v.depth for v in views]))
+            name = _MAIN_SET if self.settings.split in ("all-train", "own") else ROTATION
+            test_sets[name], facts[name] = self._views(test, images, None, "test-")
+            parts.append(facts[name])
         return Recording(
+            folder=path,
             kind="RotateColon layout",
             shots=shots,
             facts=facts,
-            fingerprint=fingerprint(path, (present_points, *pixels), (path / TRAIN, test if others else None)),
+            described_by=(path / TRAIN, test if test_sets else None),
             test_sets=test_sets,
             own_split={"train": range(len(shots)), "test": ()},
-            own_points=None if present_points is None else lambda: _pink(load_points(points)),
-            points_source=points,
-            seen=seen_masks,
+            points_source=path / POINTS,
+            read_points=lambda source: _pink(load_points(source)),
+            is_complete=not any(part["images_without_pose"] for part in parts),
         )
 
     def _views(
@@ -121,21 +115,14 @@ class RotateColonDataManager(RecordedDataManager):
         settings, content = self.settings, Transforms(transforms)
         stated = _numbers(transforms, content.names)
         order = sorted(range(len(stated)), key=stated.__getitem__)
-        numbers = [stated[index] for index in order]
         files = numbered(folder, "", frozenset({".png"}))
-        for number in numbers:
-            if number not in files:
-                raise InputError(
-                    f"{transforms}: frame {number} has no image {folder / f'{number:04d}.png'}",
-                    "an image for every frame",
-                    "Restore it, or remove the frame",
-                )
-        unposed = len(files) - len(numbers)
+        frames = {f"frame {number}": number for number in sorted(stated)}
+        images = for_every({name: files.get(number) for name, number in frames.items()}, folder, "an image")
+        unposed = len(files) - len(images)
         if unposed:
             log.warning("%s: %d images of %s have no pose and are left out", transforms, unposed, folder.name)
         deep = {} if depth_folder is None else numbered(depth_folder, "", frozenset({".exr"}))
-        depths = for_all({f"frame {number}": deep.get(number) for number in numbers}, depth_folder, "a depth file")
-        images = [files[number] for number in numbers]
+        depths = for_all({name: deep.get(number) for name, number in frames.items()}, depth_folder, "a depth file")
         angle = {"camera_angle_x": content.content.get("camera_angle_x")}
         lens = camera_of(angle, str(transforms), "half", lambda: size_of(images[0]))
         rectification = self.rectification_of(lens, images[0])
@@ -143,10 +130,7 @@ class RotateColonDataManager(RecordedDataManager):
         shots = make_shots(images, rectification, content.trajectory.camera_to_world[order], depths, form, prefix)
         facts = {
             "layout": "rotatecolon",
-            "transforms": transforms.name,
             "images_without_pose": unposed,
-            "depth_divisor": settings.depth_divisor if any(depths) else None,
-            **rectification.facts(),
             "pose_convention": "camera-to-world, OpenGL axes",
         }
         return shots, facts

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property, lru_cache, partial
+from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import torch
@@ -19,23 +19,26 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import has_alpha, read_alpha, read_rgb
 from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.core.scenes import PIXEL_MAPS, PixelSource, SparseDepth
-from coliags_plugin.datamanagers.reading.depth import DepthFormat
-from coliags_plugin.datamanagers.reading.images import all_of, read_gray, read_mask, resize_nearest, resize_rgb, size_of
+from coliags_plugin.datamanagers.reading.images import (
+    DepthFormat,
+    all_of,
+    read_gray,
+    read_mask,
+    resize_nearest,
+    resize_rgb,
+    size_of,
+)
 from coliags_plugin.geometry.lenses.models import Lens, PinholeLens
 from coliags_plugin.geometry.lenses.undistortion import Undistortion
-
-_Key = TypeVar("_Key")
 
 #: How far a raw frame's aspect ratio may be from the lens's: rounding to whole pixels, but no cropping.
 ASPECT_TOLERANCE = 0.02
 
-#: Distance of a principal point from the image centre, as a share of the image size, above which there is a warning.
-FAR_FROM_MIDDLE = 0.2
-
 #: The paper's working size, a quarter of C3VD's raw frame.
 PAPER_SIZE = (338, 270)
 
-#: Undistortions from many lenses kept at a time, some 10 MB each: as many as images are read in parallel.
+#: Undistortions kept at a time, some 10 MB each: as many as images are read in parallel. COLMAP models often have one
+#: camera per image.
 _KEPT = 8
 
 
@@ -49,25 +52,19 @@ def fitted(width: int, height: int, within: tuple[int, int] | None) -> tuple[int
     return max(1, fitted[0]), max(1, fitted[1])
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Rectification:
     """Rectification of the stored images of one camera to its working images."""
 
     lens: Lens  # of the stored images
     pinhole: Intrinsics  # of the working images
     described_by: Path  # the file with the size of the stored images, for errors
-    undistortion: Callable[[], Undistortion] | None = None  # makes it, or returns the one that is kept; None: pinholes
     stored_content: Bool[np.ndarray, "H W"] | None = None  # stored pixels with image content; None where all have
 
     @property
-    def width(self) -> int:
-        """Working width, pixels."""
-        return self.pinhole.width
-
-    @property
-    def height(self) -> int:
-        """Working height, pixels."""
-        return self.pinhole.height
+    def undistortion(self) -> Undistortion | None:
+        """Undistortion of the stored images; None if they are a pinhole camera's."""
+        return None if isinstance(self.lens, PinholeLens) else _undistortion(self)
 
     def camera(self, camera_to_world: Float[np.ndarray, "4 4"]) -> Camera:
         """The working camera at a pose."""
@@ -75,15 +72,15 @@ class Rectification:
 
     def image(self, rgb: UInt8[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "h w 3"]:
         """A colour image at the working size."""
-        if self.undistortion is None:
-            return resize_rgb(rgb, self.width, self.height)
-        return self.undistortion().image(rgb)
+        if (undistortion := self.undistortion) is None:
+            return resize_rgb(rgb, self.pinhole.width, self.pinhole.height)
+        return undistortion.image(rgb)
 
     def nearest(self, values: Shaped[np.ndarray, "H W"]) -> Shaped[np.ndarray, "h w"]:
         """Values at the working size by nearest neighbour; 0 where there is no source."""
-        if self.undistortion is None:
-            return resize_nearest(values, self.width, self.height)
-        return self.undistortion().nearest(values, 0)
+        if (undistortion := self.undistortion) is None:
+            return resize_nearest(values, self.pinhole.width, self.pinhole.height)
+        return undistortion.nearest(values, 0)
 
     def resampled(self, name: str, path: Path, values: Shaped[np.ndarray, "H W ..."]) -> Shaped[np.ndarray, "h w ..."]:
         """The per-pixel map of a name, read from a file, at the working size; checks its size as :meth:`checked`."""
@@ -93,25 +90,15 @@ class Rectification:
     @property
     def valid(self) -> Bool[np.ndarray, "h w"] | None:
         """Working pixels with image content; None where all have."""
-        valid = None if self.undistortion is None else self.undistortion().valid
-        return None if valid is None or valid.all() else valid
-
-    def doubt(self) -> str | None:
-        """Warning where the intrinsics seem to be of another resolution; None otherwise."""
-        off = max(abs(self.pinhole.cx / self.width - 0.5), abs(self.pinhole.cy / self.height - 0.5))
-        if off <= FAR_FROM_MIDDLE:
-            return None
-        return (
-            f"{self.described_by}: the principal point is {off:.0%} of the image ({self.lens.width} x "
-            f"{self.lens.height}) from its middle: are the intrinsics those of another resolution?"
-        )
+        undistortion = self.undistortion
+        return None if undistortion is None or undistortion.valid.all() else undistortion.valid
 
     def facts(self) -> dict[str, Any]:
         """For provenance: sizes, and intrinsics at the working size."""
         k = self.pinhole
         return {
             "stored_size": [self.lens.width, self.lens.height],
-            "size": [self.width, self.height],
+            "size": [self.pinhole.width, self.pinhole.height],
             "intrinsics": {"fx": k.fx, "fy": k.fy, "cx": k.cx, "cy": k.cy, "pixel_centers": "integers + 0.5"},
         }
 
@@ -128,39 +115,19 @@ class Rectification:
         return image
 
 
-def rectifications(
-    lenses: Mapping[_Key, Lens],
-    described_by: Path,
-    working_size: Callable[[int, int], tuple[int, int]],
-    focal_scale: float = 1.0,
-    shows: Bool[np.ndarray, "H W"] | None = None,
-) -> dict[_Key, Rectification]:
-    """Rectifications of images from many lenses, some of them pinholes, without keeping the maps of all.
-
-    Undistortion maps take some 10 MB each, and COLMAP models often have one camera per image. Lenses are at the size of
-    the stored images, which ``described_by`` states; others than pinholes are undistorted to their nominal pinhole, its
-    focal length times ``focal_scale``. ``shows`` are the stored pixels with image content.
-    """
-    undistort = lru_cache(maxsize=_KEPT)(lambda lens, pinhole: Undistortion(lens, pinhole, shows))
-
-    def rectification(lens: Lens) -> Rectification:
-        nominal = lens.resized(*working_size(lens.width, lens.height)).pinhole
-        if isinstance(lens, PinholeLens):
-            return Rectification(lens, nominal, described_by)
-        pinhole = replace(nominal, fx=nominal.fx * focal_scale, fy=nominal.fy * focal_scale)
-        return Rectification(lens, pinhole, described_by, partial(undistort, lens, pinhole), shows)
-
-    return {key: rectification(lens) for key, lens in lenses.items()}
+@lru_cache(maxsize=_KEPT)
+def _undistortion(rectification: Rectification) -> Undistortion:
+    return Undistortion(rectification.lens, rectification.pinhole, rectification.stored_content)
 
 
-def whole_frame(lens: Lens, image: Path) -> Lens:
-    """The lens at the size of an image of the whole calibrated frame; InputError for crops."""
+def whole_frame(lens: Lens, image: Path, described_by: str, do: str) -> Lens:
+    """The lens at the size of an image of the whole calibrated frame; InputError, with what to ``do``, for crops."""
     width, height = size_of(image)
     if abs((width / height) / (lens.width / lens.height) - 1.0) > ASPECT_TOLERANCE:
         raise InputError(
-            f"{image} is {width} x {height}",
-            f"the whole raw frame that the lens is calibrated for, {lens.width} x {lens.height} or scaled from it",
-            "Undistort cropped images yourself and give them in the undistorted layout",
+            f"{image} is {width} x {height}, but {described_by} is for {lens.width} x {lens.height}",
+            "images of that size, or scaled from it",
+            do,
         )
     return lens.resized(width, height)
 
@@ -197,11 +164,15 @@ def make_shots(
     depths: Sequence[Path | None] | None,
     depth_format: DepthFormat | None,
     prefix: str = "",
+    masks: Sequence[Path | None] | None = None,
+    confidences: Sequence[Path | None] | None = None,
 ) -> list[Shot]:
     """Frames of one camera, named by their image files behind ``prefix``."""
+    none = (None,) * len(images)
+    files = zip(images, camera_to_world, depths or none, masks or none, confidences or none, strict=True)
     return [
-        Shot(prefix + image.stem, image, rectification, pose, depth, depth_format)
-        for image, pose, depth in zip(images, camera_to_world, depths or (None,) * len(images), strict=True)
+        Shot(prefix + image.stem, image, rectification, pose, depth, depth_format, mask, confidence=confidence)
+        for image, pose, depth, mask, confidence in files
     ]
 
 
@@ -237,16 +208,19 @@ class StoredPixels(PixelSource):
 
     @override
     def read(self, name: str) -> Tensor | None:
-        stored = self.stored("depth" if name == "depth_at_least" else name)
-        if stored is None:
-            return None
-        values, schema = self._decoded(name, stored), PIXEL_MAPS[name]
-        if schema.is_length and values is not None and ((values <= 0.0) | (values > schema.high)).any():  # not of NaN
-            raise InputError(
-                f"{self.shot.depth}: depth reaches from {np.nanmin(values):g} to {np.nanmax(values):g} scene units",
-                f"above 0, and at most {schema.high:g}",
-                "Correct the scale of depth",
-            )
+        values, schema, form = self.stored(name), PIXEL_MAPS[name], self.shot.depth_format
+        if values is not None and schema.is_length and form is not None:
+            depth, bound = form.decode(values)
+            lengths = depth if name == "depth" else bound
+            values = None if lengths is None else lengths * np.float32(self.scale)
+            if values is not None and ((values <= 0.0) | (values > schema.high)).any():  # not of NaN
+                raise InputError(
+                    f"{self.shot.depth}: depth reaches from {np.nanmin(values):g} to {np.nanmax(values):g} scene units",
+                    f"above 0, and at most {schema.high:g}",
+                    "Correct the scale of depth",
+                )
+        if values is not None and name == "depth_confidence":
+            values = values.astype(np.float32) / np.float32(255.0)
         return None if values is None else torch.from_numpy(values)
 
     @override
@@ -255,69 +229,35 @@ class StoredPixels(PixelSource):
 
     def preload(self) -> None:
         """Fill the cache."""
-        for name in _READERS:
+        for name in PIXEL_MAPS:
             self.stored(name)
 
-    def _decoded(self, name: str, stored: Shaped[np.ndarray, "H W ..."]) -> Shaped[np.ndarray, "H W ..."] | None:
-        form = self.shot.depth_format
-        if name == "depth" and form is not None:
-            return form.z_depth(stored) * np.float32(self.scale)
-        if name == "depth_at_least" and form is not None:
-            bound = form.clipped_at(stored)
-            return None if bound is None else bound * np.float32(self.scale)
-        return stored.astype(np.float32) / np.float32(255.0) if name == "depth_confidence" else stored
-
     def stored(self, name: str) -> Shaped[np.ndarray, "H W ..."] | None:
-        """A map at the working size, in the stored data type."""
+        """The map that a file holds, at the working size and in the stored data type."""
+        name = "depth" if name == "depth_at_least" else name
         if not self.keep:
-            return _READERS[name](self)
+            return self._from_file(name)
         # If two threads read at the same time, the second overwrites the cache with equal data.
         if name not in self._cache:
-            self._cache[name] = _READERS[name](self)
+            self._cache[name] = self._from_file(name)
         return self._cache[name]
 
-
-def _image(pixels: StoredPixels) -> UInt8[np.ndarray, "H W 3"]:
-    shot = pixels.shot
-    return shot.rectification.resampled("image", shot.image, read_rgb(shot.image))
-
-
-def _mask(pixels: StoredPixels) -> Bool[np.ndarray, "H W"] | None:
-    shot, rectification = pixels.shot, pixels.shot.rectification
-    mask = None if shot.mask is None else rectification.resampled("mask", shot.mask, read_mask(shot.mask))
-    shown = shot.shown()
-    if shown is not None:  # working pixels that mix in the colour of a hidden one are hidden, too
-        shown = rectification.image(shown.astype(np.uint8) * 255) == 255
-    return all_of(rectification.valid, mask, shown)
-
-
-def _depth(pixels: StoredPixels) -> Shaped[np.ndarray, "H W"] | None:
-    shot = pixels.shot
-    if shot.depth is None or shot.depth_format is None:
+    def _from_file(self, name: str) -> np.ndarray | None:
+        shot, resampled = self.shot, self.shot.rectification.resampled
+        if name == "image":
+            return resampled(name, shot.image, read_rgb(shot.image))
+        if name == "mask":
+            mask = None if shot.mask is None else resampled(name, shot.mask, read_mask(shot.mask))
+            shown = shot.shown()
+            if shown is not None:  # working pixels that mix in the colour of a hidden one are hidden, too
+                shown = shot.rectification.image(shown.astype(np.uint8) * 255) == 255
+            return all_of(shot.rectification.valid, mask, shown)
+        if name == "depth" and shot.depth is not None and shot.depth_format is not None:
+            depth, mask = resampled(name, shot.depth, shot.depth_format.read(shot.depth)), self.stored("mask")
+            return depth if mask is None else np.where(mask, depth, np.zeros((), depth.dtype))
+        if name == "seen" and self.seen_mask is not None:
+            return resampled(name, self.seen_mask, read_mask(self.seen_mask))
+        if name == "depth_confidence" and shot.confidence is not None:
+            expected = "a one-channel 8-bit image of the confidence in depth, 255 = 1"
+            return resampled(name, shot.confidence, read_gray(shot.confidence, 8, expected))
         return None
-    depth = shot.rectification.resampled("depth", shot.depth, shot.depth_format.read(shot.depth))
-    mask = pixels.stored("mask")
-    return depth if mask is None else np.where(mask, depth, np.zeros((), depth.dtype))
-
-
-def _seen(pixels: StoredPixels) -> Bool[np.ndarray, "H W"] | None:
-    path = pixels.seen_mask
-    return None if path is None else pixels.shot.rectification.resampled("seen", path, read_mask(path))
-
-
-def _confidence(pixels: StoredPixels) -> UInt8[np.ndarray, "H W"] | None:
-    path = pixels.shot.confidence
-    if path is None:
-        return None
-    stored = read_gray(path, 8, "a one-channel 8-bit image of the confidence in depth, 255 = 1")
-    return pixels.shot.rectification.resampled("depth_confidence", path, stored)
-
-
-#: Readers of the maps that files hold, by name.
-_READERS: Mapping[str, Callable[[StoredPixels], np.ndarray | None]] = {
-    "image": _image,
-    "depth": _depth,
-    "mask": _mask,
-    "seen": _seen,
-    "depth_confidence": _confidence,
-}

@@ -132,8 +132,6 @@ def test_test_frames_take_true_poses_brought_into_the_mapped_world(mine):
     facts = scene.provenance.slam
     errors = np.linalg.norm((motion @ true - mapped)[:, :3, 3], axis=1)
     assert facts["ate_rmse_mm"] == pytest.approx(np.sqrt((errors**2).mean()), abs=1e-4)
-    assert facts["ate_max_mm"] == pytest.approx(errors.max(), abs=1e-4)
-    assert facts["mean_rotation_error_deg"] > 0.1 and "rigid fit" in facts["other_images"]
     compared = facts["compared_with_pose_file"]
     assert 0.0 <= compared["largest_distance_mm"] < 1e-3 and compared["largest_angle_deg"] < 1e-2
 

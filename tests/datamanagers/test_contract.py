@@ -112,8 +112,7 @@ def test_a_scene_is_the_same_again_read_from_disk_each_time_or_at_once(walls, na
     for again in (load(walls(name), name, points_count=150, keep_pixels=keep) for keep in (True, False)):
         assert torch.equal(scene.points.positions, again.points.positions)
         assert all(equal(*pair) for pair in zip(in_order(scene, name), in_order(again, name), strict=True))
-        share = again.provenance.invalid_depth_share
-        assert again.provenance == scene.provenance.model_copy(update={"invalid_depth_share": share})
+        assert again.provenance == scene.provenance
     other = load(walls(name), name, points_count=150, seed=1).points.positions
     assert len(other) == 150 and not torch.equal(other, scene.points.positions)
 
@@ -169,15 +168,13 @@ def test_depth_is_unknown_at_0_and_bounded_at_the_end_of_its_range(copied, name,
     folder, pattern = copied(name), KINDS[name].depths
     for place in range(FRAMES):
         repaint(pattern, place, lambda pixels: np.resize(steps, pixels.shape))(folder)
-    scene = load(folder, name)
-    frame = scene.train[0]
+    frame = load(folder, name).train[0]
     expected = torch.tensor(depth).repeat(WIDTH * HEIGHT // 4).reshape(HEIGHT, WIDTH)
     torch.testing.assert_close(frame.depth, expected, equal_nan=True)
     if bound is None:
         assert frame.depth_at_least is None
     else:
         torch.testing.assert_close(frame.depth_at_least[0, :4], torch.tensor(bound), equal_nan=True)
-    assert scene.provenance.invalid_depth_share == pytest.approx(np.isnan(depth).mean())
 
 
 @pytest.mark.parametrize("name", KINDS)

@@ -17,8 +17,7 @@ from coliags_plugin.core.images import has_alpha, read_8_bit, read_alpha, read_r
 from coliags_plugin.core.scene_files import named_file, numbered, short_names
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.datamanagers.fusion import fuse_depth, load_points, subsampled
-from coliags_plugin.datamanagers.reading.depth import scaled_depth
-from coliags_plugin.datamanagers.reading.images import read_mask, resize_nearest, resize_rgb
+from coliags_plugin.datamanagers.reading.images import read_mask, resize_nearest, resize_rgb, scaled_depth
 
 # Images
 
@@ -180,7 +179,7 @@ def test_depth_files_hold_numbers_proportional_to_depth(tmp_path, suffix):
     else:
         cv2.imwrite(str(path), steps.astype(np.uint16))
     form = scaled_depth(path, 0.02)
-    np.testing.assert_allclose(form.z_depth(form.read(path)), np.where(unknown, np.nan, 0.02 * steps), rtol=1e-6)
+    np.testing.assert_allclose(form.decode(form.read(path))[0], np.where(unknown, np.nan, 0.02 * steps), rtol=1e-6)
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Particular to TUM's RGB-D layout: association by time or order, scales of depth, and Gaussian Pancakes."""
+"""Particular to TUM's RGB-D layout: association by time or order, scales of depth, Gaussian Pancakes, EndoMapper."""
 
 from __future__ import annotations
 
@@ -8,17 +8,31 @@ from functools import partial
 import cv2
 import numpy as np
 import pytest
+import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.scenes import Frame
-from coliags_plugin.engine.data_formats import find_format
+from coliags_plugin.engine.data_formats import find_format, recognised
+from coliags_plugin.geometry.lenses.vicalib import read_calibration
 from coliags_plugin.geometry.poses import tum
 from coliags_plugin.geometry.poses.alignment import nearest_in_time
 from coliags_plugin.geometry.poses.trajectory import Trajectory
-from tests.datamanagers.kinds import change_lines, files, with_intrinsics
-from tests.datamanagers.wall_scenes import FRAMES, PINHOLE, load_scene, look, manager, names, poses, rays
+from tests.datamanagers.kinds import change_lines, edit, files, with_intrinsics
+from tests.datamanagers.wall_scenes import (
+    FRAMES,
+    HEIGHT,
+    PINHOLE,
+    WIDTH,
+    layout_of,
+    load_scene,
+    look,
+    manager,
+    names,
+    poses,
+    rays,
+)
 from tests.datamanagers.wall_scenes import seen_from as expected_from
 
 #: Steps per mm of the layout's depth.
@@ -232,3 +246,60 @@ def test_files_of_gaussian_pancakes_that_do_not_do(pancakes, name, text, message
     (pancakes / name).write_text(text + "\n")
     with pytest.raises(InputError, match=message):
         load(pancakes, depth="none")
+
+
+# EndoMapper: its calibration, against OpenCV's fisheye, and which folders are its
+
+
+load_endomapper = partial(load_scene, "endomapper")
+
+
+@pytest.fixture
+def endomapper(copied):
+    return copied("endomapper")
+
+
+def stored_pixels(camera, folder) -> np.ndarray:
+    """Column and row of the stored pixel behind every working pixel, by OpenCV's fisheye. [H, W, 2]"""
+    lens, k = read_calibration(folder / "calibration.xml").lens, camera.intrinsics
+    column, row = np.meshgrid(np.arange(k.width) + 0.5, np.arange(k.height) + 0.5)
+    rays = np.stack([(column - k.cx) / k.fx, (row - k.cy) / k.fy, np.ones_like(column)], axis=-1)
+    matrix = np.array([[lens.fx, 0.0, lens.cx], [0.0, lens.fy, lens.cy], [0.0, 0.0, 1.0]])
+    terms = np.array([lens.k1, lens.k2, lens.k3, lens.k4])
+    pixels, _ = cv2.fisheye.projectPoints(rays.reshape(-1, 1, 3), np.zeros(3), np.zeros(3), matrix, terms)
+    return np.floor(pixels).astype(int).reshape(*column.shape, 2)
+
+
+def test_depth_is_read_to_the_bit(walls):
+    folder = walls("endomapper")
+    scene = load_endomapper(folder)
+    calibration, written = read_calibration(folder / "calibration.xml"), layout_of("endomapper").lens(WIDTH, HEIGHT)[0]
+    points = np.random.default_rng(0).uniform((-0.8, -0.6, 1.0), (0.8, 0.6, 1.0), (50, 3))
+    np.testing.assert_allclose(calibration.lens.project(points), written.project(points), atol=1e-12)
+    pixels = stored_pixels(scene.train[0].camera, folder)
+    for frame in scene.video[::4]:
+        steps = cv2.imread(str(folder / f"depth/{frame.name}.png"), cv2.IMREAD_UNCHANGED)
+        expected = (steps[pixels[..., 1], pixels[..., 0]] / calibration.depth_scale).astype(np.float32)
+        np.testing.assert_array_equal(frame.depth, np.where(expected == 0.0, np.nan, expected))
+    assert scene.provenance.lens == "FisheyeLens"
+    assert scene.provenance.intrinsics_from == "calibration.xml"
+
+
+def test_another_camera_file_makes_it_an_rgbd_folder(endomapper):
+    assert recognised(endomapper) == {"endomapper": "the TUM trajectory trajectory.txt beside rgb/"}
+    (endomapper / "intrinsics.txt").write_text("20 20 19.5 15.5")
+    assert list(recognised(endomapper)) == ["rgbd"]
+    (endomapper / "calibration.xml").unlink()
+    (endomapper / "intrinsics.txt").unlink()
+    assert find_format(endomapper) == "rgbd"
+
+
+def test_the_scale_of_depth_is_that_of_the_file_or_the_option(endomapper):
+    before = load_endomapper(endomapper).train[0].depth
+    edit("calibration.xml", "500.0", "250.0")(endomapper)
+    torch.testing.assert_close(load_endomapper(endomapper).train[0].depth, 2.0 * before, equal_nan=True)
+    edit("calibration.xml", "<depth_scale.*", "")(endomapper)
+    torch.testing.assert_close(
+        load_endomapper(endomapper, depth_scale=250.0).train[0].depth, 2.0 * before, equal_nan=True
+    )
+    assert load_endomapper(endomapper, depth="none", initial_points="none").train[0].depth is None

@@ -11,10 +11,10 @@ import OpenEXR
 import pytest
 import torch
 
-from coliags_plugin.datamanagers.reading.depth import ExrDepth, read_exr_channel
+from coliags_plugin.datamanagers.reading.images import ExrDepth, read_exr_channel
 from tests.datamanagers.kinds import change_exr, change_json, files, remove, renumber
 from tests.datamanagers.wall_scenes import FRAMES, HEIGHT, WIDTH, load_scene, names, poses
-from tests.layouts.rotatecolon import write_exr
+from tests.layouts import write_exr
 
 Z = "ViewLayer.Depth.Z"
 
@@ -78,10 +78,10 @@ def test_what_is_no_depth_is_unknown(tmp_path):
     stored = np.array([[2.8, 0.0, -1.0, 1e10], [np.nan, np.inf, 14.0, 9e5]], np.float32)
     write_exr(tmp_path / "z.exr", {Z: stored})
     form = ExrDepth(Z, 1.4)
-    depth = form.z_depth(form.read(tmp_path / "z.exr"))
+    depth, bound = form.decode(form.read(tmp_path / "z.exr"))
     nan = math.nan
     np.testing.assert_allclose(depth, [[2.0, nan, nan, nan], [nan, nan, 10.0, 9e5 / 1.4]], rtol=1e-6)
-    assert depth.dtype == np.float32 and form.clipped_at(stored) is None
+    assert depth.dtype == np.float32 and bound is None
 
 
 @pytest.mark.parametrize("kind", [np.float16, np.float32])

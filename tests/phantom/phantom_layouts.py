@@ -1,4 +1,4 @@
-"""Tiny phantoms in every layout, those of tests/layouts among them."""
+"""Tiny phantoms in every layout, those of tests/layouts.py among them."""
 
 from __future__ import annotations
 

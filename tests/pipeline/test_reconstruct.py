@@ -33,7 +33,7 @@ from coliags_plugin.reconstruction.structure.sfm_settings import CameraSettings,
 from coliags_plugin.reporting.video import write_video
 from coliags_plugin.results.reading import read_result
 from tests import commands
-from tests.layouts.endomapper import calibration_text
+from tests.layouts import calibration_text
 from tests.pipeline.conftest import CAPTURE, TRAINING, Killed
 from tests.pipeline.films import HEIGHT, WIDTH, film, write_film, write_images
 from tests.textured_tube import INTRINSICS, tube_frames, write_tube

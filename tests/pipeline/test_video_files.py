@@ -22,7 +22,7 @@ from coliags_plugin.pipeline.survey import Survey, survey_video
 from coliags_plugin.pipeline.video_files import VideoFile
 from coliags_plugin.reconstruction.structure.sfm_settings import SfmSettings
 from coliags_plugin.reporting.video import write_video
-from tests.layouts.endomapper import calibration_text
+from tests.layouts import calibration_text
 from tests.pipeline.films import film, number_of, numbered, write_film, write_images
 
 FRAMES = numbered(40)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -43,7 +43,7 @@ class Transforms:
         """The path of a file that is named in it; it need not exist."""
         return named_file(self.path.parent, name, str(self.path), self._outside)
 
-    def files(self, key: str, for_every: bool) -> list[Path | None]:
+    def files(self, key: str, for_every: bool) -> Sequence[Path | None]:
         """The files that frames name under a key; if one does, all must where they are ``for_every`` frame."""
         paths: dict[str, Path | None] = {}
         for name, frame in zip(self.names, self.frames, strict=True):

@@ -17,7 +17,7 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.jobs import Progress, with_progress
 from coliags_plugin.core.scene_files import files_in, first_few
 from coliags_plugin.core.scenes import Frame
-from coliags_plugin.datamanagers.reading.depth import read_exr_channel, scaled_depth
+from coliags_plugin.datamanagers.reading.images import read_exr_channel, scaled_depth
 from coliags_plugin.reconstruction.depth.sweeping import MAX_TURN, Map, Mask
 from coliags_plugin.reconstruction.structure.features import (
     Features,
@@ -311,7 +311,7 @@ class FilePrior:
             stored = read_exr_channel(path, "V", "Rename it, or convert the maps to .npy")
         else:
             form = scaled_depth(path, 1.0)
-            stored = form.z_depth(form.read(path))
+            stored = form.decode(form.read(path))[0]
         height, width = stored.shape
         camera = frame.camera
         if abs(width * camera.height / (height * camera.width) - 1.0) > _ASPECT:
