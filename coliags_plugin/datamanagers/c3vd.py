@@ -156,15 +156,10 @@ class C3VDDataManager(SequenceDataManager):
 
     @override
     def rectification(self, files: SequenceFiles) -> tuple[Rectification, dict[str, Any]]:
-        settings = self.settings
-        raw = files.camera is None
-        facts = {
-            "lens": settings.lens if raw else None,
-            "mask": "octagon" if raw and settings.mask else None,
-        }
         if files.camera is not None:
-            return self.rectification_of(PinholeLens.of(reading.read_intrinsics(files.camera)), files.camera), facts
-        return self.octagon_rectification(LENSES[settings.lens], files.images[0], settings.mask), facts
+            return self.rectification_of(PinholeLens.of(reading.read_intrinsics(files.camera)), files.camera), {}
+        lens = self.settings.lens
+        return self.octagon_rectification(LENSES[lens], files.images[0], self.settings.mask), {"lens": lens}
 
 
 #: From the configuration of the same group's later renderer (C3VDv3). C3VDv2's own page gives no numbers, so this is
@@ -294,14 +289,9 @@ class C3VDv2DataManager(SequenceDataManager):
 
     @override
     def rectification(self, files: SequenceFiles) -> tuple[Rectification, dict[str, Any]]:
-        settings = self.settings
         lens, source = self._lens(files)
-        facts = {
-            "lens": settings.lens,
-            "lens_source": source,
-            "mask": "octagon" if settings.mask else None,
-        }
-        return self.octagon_rectification(lens, files.images[0], settings.mask), facts
+        facts = {"lens": self.settings.lens, "lens_source": source}
+        return self.octagon_rectification(lens, files.images[0], self.settings.mask), facts
 
     def _lens(self, files: SequenceFiles) -> tuple[Lens, str]:
         """The lens and the source of its calibration."""

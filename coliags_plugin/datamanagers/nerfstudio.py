@@ -67,12 +67,6 @@ class NerfstudioTransforms(Transforms):
             return None
         return reading.required_file(self.named(str(name)), f"the point cloud of ply_file_path in {self.path}")
 
-    def undo_applied_transform(self, positions: np.ndarray) -> np.ndarray:
-        """Transform points of the file into the world of its poses, :mod:`coliags_plugin.geometry.poses.nerfstudio`."""
-        applied = np.array(self.content.get("applied_transform", np.eye(4)), np.float64)[:3]
-        unscaled = positions / float(self.content.get("applied_scale", 1.0)) - applied[:, 3]
-        return np.asarray(unscaled @ applied[:, :3])
-
     def split(self) -> dict[str, list[int]] | None:
         """Indices of training and test frames; None if the file has no split.
 
@@ -257,9 +251,13 @@ class NerfstudioDataManager(RecordedDataManager):
         return (step or _DEPTH_STEP) * self.settings.scale
 
     def _points(self, transforms: NerfstudioTransforms, file: Path) -> PointCloud:
-        """Points of ``ply_file_path``, which are in the file's world."""
+        """Points of ``ply_file_path`` in the world of the poses, which nerfstudio has transformed."""
         cloud = load_points(file)
-        positions = transforms.undo_applied_transform(cloud.positions.double().numpy()) * self.settings.scale
+        applied = np.array(transforms.content.get("applied_transform", np.eye(4)), np.float64)[:3]
+        unscaled = (
+            cloud.positions.double().numpy() / float(transforms.content.get("applied_scale", 1.0)) - applied[:, 3]
+        )
+        positions = unscaled @ applied[:, :3] * self.settings.scale
         return PointCloud(torch.from_numpy(positions).float(), cloud.colors)
 
 

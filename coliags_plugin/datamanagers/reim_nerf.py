@@ -150,7 +150,6 @@ class ReimNerfDataManager(RecordedDataManager):
         facts: dict[str, Any] = {
             "layout": "REIM-NeRF",
             "lens": "fisheye of the JSON files",
-            "mask": MASK_FILE if settings.mask else None,
             "parts": {part: len(frames) for part, frames in indices.items()},
             "pose_convention": {
                 "order": "camera-to-world, OpenGL axes, normalised",

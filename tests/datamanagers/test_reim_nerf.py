@@ -103,5 +103,4 @@ def test_without_distances_points_come_from_a_file(mine):
     np.savez(mine / "points.npz", positions=np.ones((3, 3)))
     scene = load(mine, initial_points="file", points_file="points.npz")
     assert scene.train[0].depth is None and len(scene.points) == 3
-    assert scene.provenance.mask == "rgb_mask.png"
     assert math.isclose(scene.provenance.pose_convention["scene_scale"], content_of(mine)["scene_scale"])
