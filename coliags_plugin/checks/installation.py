@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import importlib
 import os
 import platform
@@ -80,22 +79,12 @@ def _cuda() -> str:
     if not torch.cuda.is_available():
         raise CheckSkippedError(_NO_CUDA)
     built = f"CUDA {torch.version.cuda}" if torch.version.cuda else f"ROCm {torch.version.hip}"
-    return f"PyTorch for {built}; the driver serves CUDA {_driver_version() or 'of unknown version'}"
+    return f"PyTorch for {built}"
 
 
 def _cuda_device(index: int) -> str:
     device = torch.cuda.get_device_properties(index)
     return f"{device.name}, compute capability {device.major}.{device.minor}, {device.total_memory / 2**30:.1f} GiB"
-
-
-def _driver_version() -> str | None:
-    """The newest CUDA version that the installed driver supports; None where it does not tell."""
-    number = ctypes.c_int()
-    try:
-        status = ctypes.CDLL("libcuda.so.1").cuDriverGetVersion(ctypes.byref(number))
-    except (OSError, AttributeError):  # on Windows, or none is installed
-        return None
-    return None if status else f"{number.value // 1000}.{number.value % 1000 // 10}"
 
 
 def _library(name: str, module: str) -> str:

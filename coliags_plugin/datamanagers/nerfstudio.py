@@ -253,10 +253,9 @@ class NerfstudioDataManager(RecordedDataManager):
     def _points(self, transforms: NerfstudioTransforms, file: Path) -> PointCloud:
         """Points of ``ply_file_path`` in the world of the poses, which nerfstudio has transformed."""
         cloud = load_points(file)
-        applied = np.array(transforms.content.get("applied_transform", np.eye(4)), np.float64)[:3]
-        unscaled = (
-            cloud.positions.double().numpy() / float(transforms.content.get("applied_scale", 1.0)) - applied[:, 3]
-        )
+        content = transforms.content
+        applied = np.array(content.get("applied_transform", np.eye(4)), np.float64)[:3]
+        unscaled = cloud.positions.double().numpy() / float(content.get("applied_scale", 1.0)) - applied[:, 3]
         positions = unscaled @ applied[:, :3] * self.settings.scale
         return PointCloud(torch.from_numpy(positions).float(), cloud.colors)
 
