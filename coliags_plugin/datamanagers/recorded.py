@@ -323,7 +323,7 @@ class RecordedDataManager(DataManager):
             read_points = None
         if has_depth and (settings.initial_points == "depth" or read_points is None):
             points = fuse_depth(train, settings.points_count, generator, progress)
-            return points, self._described_points("depth of the training frames", points, path)
+            return points, PointsRecord(source="depth of the training frames", count=len(points), seed=settings.seed)
         if read_points is None or source is None:
             missing = POINTS_FILE if source is None else source.name
             from_file = "`datamanager.initial_points=file` and `datamanager.points_file=FILE`"
@@ -334,12 +334,10 @@ class RecordedDataManager(DataManager):
                 f"{missing} (world of the poses) there; or {from_file}",
             )
         points = subsampled(read_points(source), settings.points_count, generator, source)
-        return points, self._described_points(source, points, path)
-
-    def _described_points(self, source: Path | str, points: PointCloud, scene: Path) -> PointsRecord:
-        name = portable_name(source, scene) if isinstance(source, Path) else source
-        checksum = {"sha256": file_sha256(source)} if isinstance(source, Path) and source.is_file() else {}
-        return PointsRecord(source=name, count=len(points), seed=self.settings.seed, **checksum)
+        record = PointsRecord(
+            source=portable_name(source, path), count=len(points), seed=settings.seed, sha256=file_sha256(source)
+        )
+        return points, record
 
 
 def _held_out_used(recording: Recording, test: Sequence[int]) -> dict[str, list[str] | None]:
