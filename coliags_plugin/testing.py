@@ -204,7 +204,10 @@ def check_gradients(context: CheckContext) -> None:
 def check_renders(context: CheckContext) -> Trainer:
     """Every output has its shape and finite values in range, for views of the video, another size and a free camera."""
     trainer, frame = context.result_of(check_trains), context.scene.train[0]
-    depths, small = _depth_range(context.scene), _resized(frame.camera)
+    small, train = _resized(frame.camera), context.scene.train
+    known = [frame.depth[frame.depth.isfinite()] for frame in train[:4] if frame.depth is not None]
+    z = torch.cat(known) if known else context.scene.depths_in_view()
+    depths = (float(z.min()), float(z.max())) if len(z) else None
     views: dict[str, tuple[Camera, View | None]] = {
         "a training view": (frame.camera, frame.view(trained=True)),
         "an untrained view": (frame.camera, replace(frame.view(trained=False), name="no such frame", time=0.5)),
@@ -215,13 +218,6 @@ def check_renders(context: CheckContext) -> Trainer:
         fault = _wrong(_maps(trainer.model, camera, view), trainer.model, camera, depths)
         fail_if(fault, f"{what} of {camera.width} x {camera.height} pixels")
     return trainer
-
-
-def _depth_range(scene: Scene) -> tuple[float, float] | None:
-    """Smallest and largest z-depth known in a few training frames, else of the initial points; None without any."""
-    depths = [frame.depth[frame.depth.isfinite()] for frame in scene.train[:4] if frame.depth is not None]
-    z = torch.cat(depths) if depths else scene.depths_in_view()
-    return (float(z.min()), float(z.max())) if len(z) else None
 
 
 def _resized(camera: Camera) -> Camera:
@@ -464,15 +460,16 @@ def _few_frames(context: CheckContext) -> TrainedRun:
 # Scenes that lack something, and pixels that are to be ignored
 
 _VARIANTS: dict[str, Callable[[Scene], Scene]] = {
-    "without depth": lambda scene: replace(scene, train=[_without_depth(frame) for frame in scene.train]),
+    "without depth": lambda scene: replace(
+        scene,
+        train=[
+            replace(frame.with_maps(depth=None, depth_at_least=None, depth_confidence=None), sparse_depth=None)
+            for frame in scene.train
+        ],
+    ),
     "without points": lambda scene: replace(scene, points=PointCloud(torch.zeros(0, 3))),
     "with one frame": lambda scene: replace(scene, train=scene.train[:1]),
 }
-
-
-def _without_depth(frame: Frame) -> Frame:
-    bare = frame.with_maps(depth=None, depth_at_least=None, depth_confidence=None)
-    return replace(bare, sparse_depth=None)
 
 
 def check_other_data(context: CheckContext) -> None:

@@ -196,11 +196,13 @@ class RecordedDataManager(DataManager):
                 "Add the depth, or leave the confidence out",
             )
         train_indices, test_indices = self._split(recording, path)
-        seen = self._seen_masks(recording, train_indices, bool(test_indices))
+        seen_masks = self._seen_masks(recording, train_indices, bool(test_indices))
         train = self._frames(recording.shots, train_indices, {})
-        test_sets = {"test": self._frames(recording.shots, test_indices, seen.get("video", {}))} if test_indices else {}
+        test_sets = (
+            {"test": self._frames(recording.shots, test_indices, seen_masks.get("video", {}))} if test_indices else {}
+        )
         for name, shots in recording.test_sets.items():
-            test_sets[name] = self._frames(shots, range(len(shots)), seen.get(name, {}))
+            test_sets[name] = self._frames(shots, range(len(shots)), seen_masks.get(name, {}))
         _ = recording.shots[0].rectification.undistortion  # made once, before images are read in parallel
         if settings.keep_pixels:
             frames = sorted(chain(train, *test_sets.values()), key=lambda frame: frame.index)
