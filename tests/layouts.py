@@ -37,7 +37,6 @@ class C3VDRawLayout(Layout):
     has_rotation = True
 
     def lens(self, width, height):
-        """C3VD's omnidirectional lens behind its octagonal mask."""
         return LENSES["omnidirectional"].resized(width, height), octagon_mask(width, height)
 
     def write_frame(self, folder, frame):
@@ -55,7 +54,6 @@ class C3VDv2Layout(C3VDRawLayout):
     name = "c3vd-v2"
 
     def lens(self, width, height):
-        """The candidate for C3VDv2's lens, behind C3VD's octagonal mask."""
         return CANDIDATE_LENS.resized(width, height), octagon_mask(width, height)
 
     def write_frame(self, folder, frame):
@@ -88,11 +86,9 @@ class EndoGSLAMLayout(Layout):
     has_points = True
 
     def is_test(self, index):
-        """EndoGSLAM's: 7, 15, 23, ..."""
         return index % TEST_EVERY == TEST_EVERY - 1
 
     def lens(self, width, height):
-        """EndoGSLAM's camera of undistorted frames, scaled to the size. All pixels are lit."""
         return PinholeLens.of(PREPARED_PINHOLE.resized(width, height)), np.ones((height, width), bool)
 
     def write_frame(self, folder, frame):
@@ -128,7 +124,6 @@ class PREndoLayout(EndoGSLAMLayout):
         _write_gaussians(cloud, means, points.colors)
 
     def seen_mask(self, folder, part, index):
-        """Path in the scene's folder, beside the images."""
         return super().seen_mask(folder / _DATA / _SCENE, part, index)
 
 
@@ -183,7 +178,6 @@ class EndoMapperLayout(Layout):
     default_size = (1440, 1080)
 
     def lens(self, width, height):
-        """A wide Kannala-Brandt lens, and the circle of its image."""
         lens = _LENS.resized(width, height)
         column, row = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
         rays = lens.unproject(np.stack([column.ravel(), row.ravel()], axis=1))
@@ -236,7 +230,6 @@ class ReimNerfLayout(Layout):
     default_size = (1350, 1080)
 
     def lens(self, width, height):
-        """REIM-NeRF's lens, and the circle that its preprocessing keeps."""
         lens = LENSES["fisheye"].resized(width, height)
         # Its preprocessing counts pixel centres at integers.
         cx, cy = lens.pinhole.cx - 0.5, lens.pinhole.cy - 0.5
@@ -326,11 +319,9 @@ class RotateColonLayout(Layout):
     has_points = True
 
     def is_test(self, index):
-        """Never: the test views are the rotation views."""
         return False
 
     def lens(self, width, height):
-        """Square pixels, the principal point in the middle. All pixels are lit."""
         focal = 0.5 * width / math.tan(0.5 * _ANGLE)
         lens = PinholeLens(focal, focal, 0.5 * width, 0.5 * height, width, height)
         return lens, np.ones((height, width), bool)
@@ -357,7 +348,6 @@ class RotateColonLayout(Layout):
         write_ply(folder / POINTS, point_properties(points.positions, points.colors))
 
     def seen_mask(self, folder, part, index):
-        """Path in ``truth/``, since the dataset has no seen masks."""
         return folder / "truth" / "seen" / f"{index:04d}_seen.png"
 
 
