@@ -267,15 +267,13 @@ class AppearanceHead(Head[SettingsT]):
         """True if :meth:`forward` and :meth:`apply_light` are given the normals of the wall; default: not."""
         return False
 
-    def init_from_distances(self, distances: Float[Tensor, "D"]) -> None:
-        """Adapt the initial parameters to the distances of the scene, before training.
+    def prepare(self, scene: Scene, distances: Float[Tensor, "D"]) -> None:
+        """Adapt the initial parameters to the scene, before training.
 
         Args:
+            scene: The scene.
             distances: From cameras to anchors in their view, scene units. [D]
         """
-
-    def prepare(self, scene: Scene) -> None:
-        """Adapt the initial parameters to the colours of the scene, before training."""
 
     @abstractmethod
     def forward(self, anchors: SeenAnchors) -> Float[Tensor, "V K 3"]:

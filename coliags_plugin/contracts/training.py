@@ -104,19 +104,12 @@ class Strategy(ABC, Configurable[SettingsT]):
     def plan(self) -> str:
         """One sentence for the log: the steps at which it grows or prunes, or why it will not."""
 
-    def before_step(self, step: int, field: Any, rows: ParameterRows) -> None:
-        """Called before step ``step`` renders."""
-
     def after_backward(self, step: TrainingStep, rows: ParameterRows) -> dict[str, int]:
         """Called after ``backward`` and before the optimisers step.
 
         Returns:
             Counts of changes for the log, for instance ``{"grown": 12, "pruned": 3}``; empty without changes.
         """
-        return {}
-
-    def after_step(self, step: TrainingStep, rows: ParameterRows) -> dict[str, int]:
-        """Called after the optimisers have stepped; returns like :meth:`after_backward`."""
         return {}
 
     def state_dict(self) -> dict[str, Tensor]:

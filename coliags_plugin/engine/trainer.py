@@ -193,7 +193,6 @@ class Trainer:
         """
         step = self.step + 1
         self.model.field.before_step(step, self.schedule)
-        self.strategy.before_step(step, self.model.field, self.optimizers)
         output, target, views = self._render(self.sampler.next())
         training_step = TrainingStep(output, target, self.model, step, self.schedule)
         active = {key: loss for key, loss in self.losses.items() if loss.settings.active(step, self.schedule)}
@@ -216,7 +215,6 @@ class Trainer:
             torch.autograd.backward(total)
         changes = self.strategy.after_backward(training_step, self.optimizers)
         self.optimizers.step(step)
-        changes = changes | self.strategy.after_step(training_step, self.optimizers)
         for view, stages in views:
             for module, stage in zip(self.model.view_modules.values(), stages, strict=False):
                 module.after_step(view, stage)

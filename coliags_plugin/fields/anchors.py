@@ -112,8 +112,7 @@ class AnchorField(GaussianField[AnchorFieldSettings]):
         with torch.no_grad():
             field.scalings.copy_(log_scales[:, None].expand(-1, 6))
             cameras = [frame.camera for frame in scene.train[:: max(1, len(scene.train) // _DISTANCE_CAMERAS)]]
-            field.appearance_head.init_from_distances(torch.cat([field._distances(camera) for camera in cameras]))
-        field.appearance_head.prepare(scene)
+            field.appearance_head.prepare(scene, torch.cat([field._distances(camera) for camera in cameras]))
         logger.info("%d points in voxels of %.3g scene units make %d anchors", len(scene.points), size, len(anchors))
         return field
 

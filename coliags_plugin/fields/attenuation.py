@@ -77,19 +77,14 @@ class AttenuatedAppearanceHead(AppearanceHead[AttenuatedAppearanceSettings]):
     @property
     def uses_normals(self) -> bool:
         """True if the law has an exponent of incidence, or the head below uses them."""
-        return self._knows_incidence or self.head.uses_normals
+        return self.settings.incidence_exponent is not None or self.head.uses_normals
 
     @torch.no_grad()
-    def init_from_distances(self, distances: Float[Tensor, "D"]) -> None:
-        """Take the median distance as the reference."""
-        self.head.init_from_distances(distances)
+    def prepare(self, scene: Scene, distances: Float[Tensor, "D"]) -> None:
+        """Take the median distance as the reference, and start at the light of surface points if settings say so."""
+        self.head.prepare(scene, distances)
         if len(distances):
             self.reference.copy_(distances.median())
-
-    @torch.no_grad()
-    def prepare(self, scene: Scene) -> None:
-        """Start at the light of the scene's surface points, if the settings say so."""
-        self.head.prepare(scene)
         fitted = fit_light(scene) if self.settings.initial == "points" else None
         if fitted is None:
             return
@@ -117,17 +112,13 @@ class AttenuatedAppearanceHead(AppearanceHead[AttenuatedAppearanceSettings]):
         """Position of the lamp in camera axes, scene units. [3]"""
         return MAX_OFFSET * torch.tanh(self.lamp_offset / MAX_OFFSET)
 
-    @property
-    def _knows_incidence(self) -> bool:
-        return self.settings.incidence_exponent is not None
-
     def law(
         self, distances: Float[Tensor, "N"], cosines: Float[Tensor, "N"], incidences: Float[Tensor, "N"] | None = None
     ) -> Float[Tensor, "N C"]:
         """The law's factor at distances to the lamp, scene units, and cosines of psi and i; without incidences, 1."""
         relative = (distances / self.reference).clamp_min(_MIN_DISTANCE)
         logs = [relative.log(), cosines.clamp_min(_MIN_COSINE).log()]
-        if self._knows_incidence:
+        if self.settings.incidence_exponent is not None:
             facing = torch.ones_like(distances) if incidences is None else incidences.clamp_min(_MIN_INCIDENCE)
             logs.append(facing.log())
         return (torch.stack(logs, dim=1) @ self.exponents.T).exp()
@@ -142,7 +133,7 @@ class AttenuatedAppearanceHead(AppearanceHead[AttenuatedAppearanceSettings]):
     ) -> Float[Tensor, "N 3"]:
         """The colours under the lamp, which does not move Gaussians: positions get no gradient from it."""
         positions = positions.detach()
-        facing = normals if self._knows_incidence else None
+        facing = None if self.settings.incidence_exponent is None else normals
         if light is not None:
             incidences = None if facing is None else (light.towards(positions, facing) * facing).sum(1).abs()
             return colors * self.law(*light.incidence(positions), incidences)

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from typing_extensions import TypeVar
 
 from coliags_plugin.contracts import AppearanceHead, GeometryHead, HeadNetworks, SeenAnchors
+from coliags_plugin.core.scenes import Scene
 from coliags_plugin.core.settings import Settings
 from coliags_plugin.fields.mlp import mlp, outputs
 
@@ -138,7 +139,7 @@ class MLPAppearanceHead(AppearanceHead[AppearanceT]):
         """Inputs of the MLP besides the feature: the direction as encoded, then the distance if :attr:`knows_lamp`."""
 
     @torch.no_grad()
-    def init_from_distances(self, distances: Float[Tensor, "D"]) -> None:
+    def prepare(self, scene: Scene, distances: Float[Tensor, "D"]) -> None:
         """Initialise the biases so that each hidden unit's kink is at a distance of the scene (docs/methods.md 3.4).
 
         Drawn about zero, units see millimetres that outweigh all other inputs: those with a negative weight for the

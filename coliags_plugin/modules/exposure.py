@@ -12,7 +12,6 @@ import torch
 from jaxtyping import Float, Int
 from pydantic import Field
 from torch import Tensor, nn
-from typing_extensions import Self
 
 from coliags_plugin.contracts import ViewModule
 from coliags_plugin.core.json_files import JsonObject
@@ -209,10 +208,6 @@ class FrameGain(ViewModule[FrameGainSettings]):
         limit = math.log(self.settings.max_gain)
         return log_gains.clamp(-limit, limit)
 
-    def gains(self) -> Float[Tensor, "F C"]:
-        """The gain of every training frame, in their order."""
-        return self.log_gains().exp()
-
     def gain(self, view: View | None) -> Float[Tensor, "C"]:
         """The gain of a view."""
         log_gains = self.log_gains()
@@ -272,15 +267,10 @@ class CameraResponse(ViewModule[ResponseSettings]):
         log_slope: Logarithm of the slope of every segment. [K]
     """
 
-    def __init__(self, settings: ResponseSettings) -> None:
+    def __init__(self, settings: ResponseSettings, scene: Scene) -> None:
         super().__init__()
         self.settings = settings
         self.log_slope = nn.Parameter(torch.zeros(settings.segments))
-
-    @classmethod
-    def from_scene(cls, scene: Scene, settings: ResponseSettings, generator: torch.Generator) -> Self:
-        """A response module that starts as the identity curve."""
-        return cls(settings)
 
     @property
     def untrained_views(self) -> str:

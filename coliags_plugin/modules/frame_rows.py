@@ -22,9 +22,6 @@ class FrameRows:
     def __init__(self, scene: Scene) -> None:
         self.rows: Mapping[str, int] = {frame.name: row for row, frame in enumerate(scene.train)}
         self.times = [float(frame.index) for frame in scene.train]
-        by_time = sorted((time, row) for row, time in enumerate(self.times))
-        self._sorted_times = [time for time, _ in by_time]
-        self._rows_by_time = [row for _, row in by_time]
         self._nearest = _nearest_rows(scene)
 
     def __len__(self) -> int:
@@ -47,11 +44,10 @@ class FrameRows:
         if self.is_beside(view):
             row = self._nearest[view.name]
             return row, row, 0.0
-        index = bisect_right(self._sorted_times, view.time)
-        before, after = max(0, index - 1), min(index, len(self._sorted_times) - 1)
-        span = self._sorted_times[after] - self._sorted_times[before]
-        share = (view.time - self._sorted_times[before]) / span if span > 0 else 0.0
-        return self._rows_by_time[before], self._rows_by_time[after], share
+        index = bisect_right(self.times, view.time)
+        before, after = max(0, index - 1), min(index, len(self.times) - 1)
+        span = self.times[after] - self.times[before]
+        return before, after, (view.time - self.times[before]) / span if span > 0 else 0.0
 
     def interpolated(self, values: Float[Tensor, "F *S"], view: View) -> Float[Tensor, "*S"]:
         """Look up a training frame's values, or interpolate between those around another view in time.
@@ -72,8 +68,8 @@ class FrameRows:
         """
         if self.row(view) is not None or self.neighbours(view)[2] == 0.0:
             return self.interpolated(values, view)
-        known = values.detach()[self._rows_by_time].cpu().double().numpy()
-        return torch.from_numpy(Akima1DInterpolator(self._sorted_times, known)(view.time)).to(values)
+        curve = Akima1DInterpolator(self.times, values.detach().cpu().double().numpy())
+        return torch.from_numpy(curve(view.time)).to(values)
 
 
 def _nearest_rows(scene: Scene) -> dict[str, int]:

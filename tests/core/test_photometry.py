@@ -81,21 +81,21 @@ def test_masked_pixels_have_no_influence_to_the_bit():
 def test_the_module_starts_with_them_where_there_is_depth():
     settings = FrameGain.Settings(channels=3, initial="points")
     module = FrameGain.from_scene(gained(GAINS), settings, torch.Generator())
-    assert module.gains().tolist() == [[1.0] * 3] * 7
+    assert module.log_gains().exp().tolist() == [[1.0] * 3] * 7
     module.prepare(gained(GAINS))
     expected = (GAINS.log() - GAINS.log().mean()).exp()
-    for channel in module.gains().detach().T:
+    for channel in module.log_gains().exp().detach().T:
         assert channel.tolist() == pytest.approx(expected.tolist(), rel=0.015)
-    before = module.gains().detach().log()
+    before = module.log_gains().exp().detach().log()
     optimizer = torch.optim.SGD(module.parameters(), lr=1.0)
     module.log_gains()[2].sum().backward()
     optimizer.step()
     # The sum of three logarithms, relative to their mean over seven frames: both factors are a tenth.
-    moved = (module.gains().detach().log() - before).abs().max()
+    moved = (module.log_gains().exp().detach().log() - before).abs().max()
     assert moved.item() == pytest.approx(0.1 * 0.1 * 6 / 7, rel=1e-3)
     without = FrameGain.from_scene(gained(GAINS, depth=False), settings, torch.Generator())
     without.prepare(gained(GAINS, depth=False))
-    assert without.gains().tolist() == [[1.0] * 3] * 7
+    assert without.log_gains().exp().tolist() == [[1.0] * 3] * 7
     few = replace(wall_scene(), train=wall_scene().train[:2])
     assert fit_light(few) is None
 

@@ -307,7 +307,7 @@ def turned_camera():
 def test_the_factor_is_the_law_about_the_median_distance():
     exponents = [[-0.8, 1.5], [-0.5, 0.0], [-1.0, 2.0]]  # of each channel
     head = make_attenuated(channels=3)
-    head.init_from_distances(torch.tensor([10.0, 20.0, 70.0]))
+    head.prepare(wall_scene(), torch.tensor([10.0, 20.0, 70.0]))
     with torch.no_grad():
         head.exponents.copy_(torch.tensor(exponents))
     distances, cosines = torch.tensor([20.0, 40.0, 10.0]), torch.tensor([1.0, 0.9, 0.5])
