@@ -230,7 +230,7 @@ class ReconstructCommand(options.ReconstructOptions):
         }
         settings = {key: value for key, value in options.items() if value is not None}
         record = reconstruct(replace(self, settings=(*assignments(settings), *self.settings)))
-        contents = read_contents(self.output, record, scene=self.video)
+        contents = read_contents(self.output, record)
         finished = [submap for submap in contents.submaps if "report" in submap.stages and not submap.failure]
         largest = max(finished, key=lambda submap: len(submap.names))
         print_summary(

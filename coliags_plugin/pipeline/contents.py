@@ -128,7 +128,7 @@ class Contents:
     """The folder of a reconstruction."""
 
     folder: Path
-    video: Video  # of a scene with poses without a list of its frames, of one frame
+    video: Video  # of a scene with poses, of one frame
     stages: Mapping[str, StageRecord]
     segments: Sequence[SegmentContents]
     joins: Sequence[SegmentJoin] = ()
@@ -153,8 +153,8 @@ class Contents:
 
     @property
     def has_frames(self) -> bool:
-        """True if the frames are known one by one: not of a scene with poses without a list of them."""
-        return self.video.size is not None or bool(self.used)
+        """True if there is a survey of frames: not of a scene with poses."""
+        return self.video.size is not None
 
     def seconds(self, frames: Sequence[float] | np.ndarray) -> Float64[np.ndarray, "N"]:
         """Times of frames by their numbers, s; the numbers where neither times nor a rate are known."""
@@ -168,8 +168,8 @@ class _Joins(BaseModel):
     joins: list[SegmentJoin] = []
 
 
-def read_contents(out: Path, record: Record | None = None, scene: Path | None = None) -> Contents:
-    """Read the folder of a reconstruction, as far as there are files; ``scene`` is where poses are, if they were given.
+def read_contents(out: Path, record: Record | None = None) -> Contents:
+    """Read the folder of a reconstruction, as far as there are files.
 
     Raises:
         InputError: A file is damaged, or there is no record.
@@ -178,15 +178,11 @@ def read_contents(out: Path, record: Record | None = None, scene: Path | None = 
     stages = record.stages
     if not stages:
         raise InputError(f"no stage in {out / RECORD_FILE}", "the folder of a reconstruction, which has begun")
-    posed = None if "survey" in stages else scene
     if record.is_done("survey"):
         video = figures_as(stages, "survey", Video, out)
     else:
-        atlas = None if posed is None else read_atlas(posed)
-        count = len(atlas.frames) if atlas else 0
-        segments = (Segment(0, max(0, count - 1), ""),)
-        video = Video(source=(scene or out).resolve().name, frames=max(1, count), segments=segments)
-    contents = [_read_segment(out / span.name, span, record.within(span.name), video, posed) for span in video.segments]
+        video = Video(source=out.resolve().name, frames=1, segments=(Segment(0, 0, ""),))
+    contents = [_read_segment(out / span.name, span, record.within(span.name), video) for span in video.segments]
     joins = figures_as(stages, "joins", _Joins, out).joins if "joins" in stages else []
     survey = Survey.read(out) if (out / SURVEY_FILE).is_file() else None
     if survey is not None:
@@ -207,19 +203,12 @@ def figures_as(stages: Mapping[str, StageRecord], name: str, kind: type[ModelT],
         return kind.model_validate(stages[name].figures)
 
 
-def _read_segment(
-    folder: Path, span: Segment, stages: Mapping[str, StageRecord], video: Video, posed: Path | None
-) -> SegmentContents:
-    """Read a segment; ``posed`` is a scene whose poses were given: its frames are those of its atlas."""
-    scene, lost = posed or folder / "poses", dict[int, str]()
-    atlas = read_atlas(scene)
-    if posed is not None:
-        images, used = posed / IMAGES, dict(enumerate(atlas.frames if atlas else ()))
-    else:
-        images, used = folder / "frames" / IMAGES, {}
-        if frames := FramesRecord.read(folder / "frames"):
-            lost = {frame.frame: frame.why for frame in frames.dropped}
-            used = {frame.frame: f"{frame.name}.png" for frame in frames.kept if span.first <= frame.frame <= span.last}
+def _read_segment(folder: Path, span: Segment, stages: Mapping[str, StageRecord], video: Video) -> SegmentContents:
+    atlas, frames = read_atlas(folder / "poses"), FramesRecord.read(folder / "frames")
+    lost, used = dict[int, str](), dict[int, str]()
+    if frames is not None:
+        lost = {frame.frame: frame.why for frame in frames.dropped}
+        used = {frame.frame: f"{frame.name}.png" for frame in frames.kept if span.first <= frame.frame <= span.last}
     by_submap: dict[int, dict[str, StageRecord]] = {}
     for name, stage in stages.items():
         place, _, step = name.rpartition("/")
@@ -241,8 +230,9 @@ def _read_segment(
                 submaps[number] = SubmapContents(span.name, model, by_submap.get(number, {}), ordered, units[model])
         except (LookupError, ValueError) as error:
             text = f"{error}".encode(errors="backslashreplace").decode()  # a name may be any text
-            raise InputError(f"{scene / ATLAS_FILE} does not fit the frames: {text}", MADE) from error
-    return SegmentContents(span, stages, [submaps[number] for number in sorted(submaps)], images, used, lost)
+            raise InputError(f"{folder / 'poses' / ATLAS_FILE} does not fit the frames: {text}", MADE) from error
+    largest_first = [submaps[number] for number in sorted(submaps)]
+    return SegmentContents(span, stages, largest_first, folder / "frames" / IMAGES, used, lost)
 
 
 def _frame_numbers(atlas: AtlasRecord, numbers: Mapping[str, int], video: Video) -> list[int]:
@@ -265,24 +255,23 @@ def common_frames(contents: Contents) -> dict[ModelKey, tuple[ModelKey, Float[np
 
     A sub-map that is joined to no other is its own first. Of several ways from one to another the shortest counts.
     """
-    submaps = [submap for submap in contents.submaps if submap.names]
-    neighbours: dict[ModelKey, list[tuple[ModelKey, np.ndarray]]] = {submap.key: [] for submap in submaps}
+    posed = [submap.key for submap in contents.submaps if submap.names]
+    transforms: dict[tuple[ModelKey, ModelKey], np.ndarray] = {}
     for join in contents.joins:
         first, second = join.keys
-        if join.joined and first in neighbours and second in neighbours:
+        if join.joined and first in posed and second in posed:
             to_first = np.array(join.transform, dtype=np.float64)
-            neighbours[first].append((second, to_first))
-            neighbours[second].append((first, np.linalg.inv(to_first)))
+            transforms.setdefault((first, second), to_first)
+            transforms.setdefault((second, first), np.linalg.inv(to_first))
     placed: dict[ModelKey, tuple[ModelKey, np.ndarray]] = {}
-    for submap in submaps:
-        if submap.key in placed:
+    for start in posed:
+        if start in placed:
             continue
-        placed[submap.key] = submap.key, np.eye(4)
-        reached = [submap.key]
+        placed[start], reached = (start, np.eye(4)), [start]
         for key in reached:  # grows: breadth first
-            for other, to_key in neighbours[key]:
-                if other not in placed:
-                    placed[other] = submap.key, placed[key][1] @ to_key
+            for (to, other), transform in transforms.items():
+                if to == key and other not in placed:
+                    placed[other] = start, placed[key][1] @ transform
                     reached.append(other)
     return placed
 

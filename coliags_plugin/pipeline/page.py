@@ -70,16 +70,15 @@ _SUSPECT = (
 )
 
 
-def write_page(out: Path, record: Record | None = None, scene: Path | None = None) -> None:
+def write_page(out: Path, record: Record | None = None) -> None:
     """Write ``index.html`` into the folder of a reconstruction: one file that opens offline.
 
-    It has at most 50 MB; scenes and pictures that have no room in it are loaded from the folder. ``scene`` is where
-    poses are, if they were given.
+    It has at most 50 MB; scenes and pictures that have no room in it are loaded from the folder.
 
     Raises:
         InputError: ``out`` is of no reconstruction, or a file in it is damaged; or the page cannot be written.
     """
-    contents = read_contents(out, record, scene)
+    contents = read_contents(out, record)
     states = frame_states(contents)
     sections = [
         Section("Scenes", list(_scenes(contents))),

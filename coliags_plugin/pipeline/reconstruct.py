@@ -115,7 +115,7 @@ def reconstruct(
             summary = f"{sum(join.joined for join in joins)} of {counted(len(joins), 'join')}"
             figures = {"joins": [join.model_dump(mode="json") for join in joins]}
             record.put("joins", StageRecord(summary, figures=figures))
-        write_page(out, record, source)
+        write_page(out, record)
     if not segments:
         raise InputError(
             f"no stretch of {source} of {settings.least_submap} frames in which points can be followed",
@@ -245,25 +245,29 @@ class StageJobs:
             context = replace(segment, settings=segment.settings.model_copy(update={"sfm": sfm}))
             check_options(stages_of(context), self.record, self._overwrite, self.record.of_submaps(context.prefix))
             shared = StageJob(self, context, round(_SHARED_WORK * size))
-            jobs += self._begin_submaps(shared) if shared.is_done else [shared]
+            jobs += self.end(shared) if shared.is_done else [shared]
         return jobs
 
     def _begin_submaps(self, shared: StageJob) -> list[StageJob]:
-        """Jobs of the sub-maps of a segment that has poses, and of the segments that have waited for them."""
+        """Jobs of the sub-maps of a segment that has poses, but those that are done."""
         contexts, size = shared.context.submaps(), shared.size / _SHARED_WORK - shared.size
         frames = [context.submap.frames or 1 for context in contexts if context.submap]
         jobs = list[StageJob]()
         for context, count in zip(contexts, frames, strict=True):
             check_options(stages_of(context), self.record, self._overwrite)
             jobs.append(StageJob(self, context, round(size * count / sum(frames))))
-        return [*(job for job in jobs if not job.is_done), *self._begin_segments(shared.context.posed)]
+        return [job for job in jobs if not job.is_done]
 
     def end(self, job: StageJob, error: ReportedError | None = None) -> list[StageJob]:
-        """Take that a job has ended, or why it failed; returns what is to be done after it."""
+        """Take that a job has ended, or why it failed; returns what is to be done after it.
+
+        After the poses of a segment, that are its sub-maps, and the segments that have waited for its camera.
+        """
         if error is not None:
             self.failures.append((job.context, error))
-            return self._begin_segments(job.context.posed) if job.context.submap is None else []
-        return self._begin_submaps(job) if job.context.submap is None else []
+        if job.context.submap is not None:
+            return []
+        return [*(self._begin_submaps(job) if error is None else ()), *self._begin_segments(job.context.posed)]
 
 
 def _camera_of(scene: Path) -> CameraSettings | None:
@@ -339,18 +343,14 @@ class StageJob(Job):
         record.refresh()
         return {stage.name: record.stages.get(stage.name, StageRecord(state="failed")) for stage in self.stages}
 
-    def finish(self) -> Sequence[Job]:
-        """Take up what the worker has written, and return the jobs after it."""
-        return self._end()
-
     def fail(self, reason: str, attempts: int, ending: Ending) -> Sequence[Job]:
         """Record the failure, and return the jobs after it; a disk that cannot be written ends all of them."""
         if ending == "unwritable":
             raise NotWritableError(f"{self.task.title}: {reason}", do="What is done is kept")
-        return self._end(InputError(reason or "it failed"))
+        return self.finish(InputError(reason or "it failed"))
 
-    def _end(self, error: InputError | None = None) -> Sequence[Job]:
-        """Log what the worker has written; a stage at which its process died has failed."""
+    def finish(self, error: InputError | None = None) -> Sequence[Job]:
+        """Log what the worker has written, and return the jobs after it; a stage at which it died has failed."""
         for name, stage in self._states().items() if error is not None else ():
             if stage.state == "begun":
                 self._jobs.record.put(name, replace(stage, state="failed", summary=str(error)))

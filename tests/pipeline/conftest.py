@@ -4,30 +4,18 @@ from __future__ import annotations
 
 import shutil
 
-import numpy as np
 import pytest
 
-from coliags_plugin.core.files import write_json
-from coliags_plugin.core.images import write_image
-from coliags_plugin.core.scene_files import write_unit
-from coliags_plugin.datamanagers.colmap import ATLAS_FILE
-from coliags_plugin.geometry.poses.colmap import write_reconstruction
-from coliags_plugin.phantom.layouts import SeenPoints, add_points
 from coliags_plugin.pipeline import reconstruct, steps
 from coliags_plugin.pipeline.reconstruct import StageTask
 from coliags_plugin.pipeline.stages import StageRecord
 from coliags_plugin.reporting.video import write_video
 from tests.pipeline.films import film
-from tests.reconstruction.seen_points import frame_model
+from tests.pipeline.reconstructions import write_atlas, write_long, write_short
 from tests.task_list import TaskList
-from tests.textured_tube import tube_frames
 
 CAPTURE = ("make_poses", "check_data", "estimate_depth")
 TRAINING = ("train", "evaluate", "mesh", "coverage", "show", "report")
-
-
-#: Frames of the models, along the video; the last is too small.
-COUNTS = (14, 12, 5)
 
 
 class Killed(BaseException):
@@ -59,32 +47,6 @@ def video(tmp_path):
     return tmp_path / "film.mp4"
 
 
-def write_atlas(folder, counts=COUNTS, units=("unknown", "unknown", "unknown"), listed=True):
-    """A scene of several models, each with a point before every camera, and the ``atlas.json`` that lists them."""
-    (folder / "images").mkdir(parents=True)
-    start, submaps, names = 0, [], []
-    for number, count in enumerate(counts):
-        frames = tube_frames(count, 1.0, (40, 32))
-        own = [f"{start + index:03d}.png" for index in range(count)]
-        for frame, name in zip(frames, own, strict=True):
-            write_image(folder / "images" / name, frame.image.numpy())
-        model = frame_model(frames, own)
-        poses = np.stack([frame.camera.camera_to_world.numpy() for frame in frames])
-        points = poses[:, :3, 3] + 2.0 * (number + 1) * poses[:, :3, 2]
-        seen = [SeenPoints(np.array([[20.0, 16.0]]), np.array([index])) for index in range(count)]
-        add_points(model, seen, points, np.zeros((count, 3), np.uint8))
-        write_reconstruction(folder / f"sparse/{number}", model)
-        stretch = {"model": f"sparse/{number}", "unit": units[number], "frames": [*range(start, start + count)]}
-        submaps.append(stretch)
-        names += own
-        start += count
-    write_unit(folder, units[0])
-    if listed:
-        lost = [{"frame": start, "reason": "blurred"}]
-        write_json(folder / ATLAS_FILE, {"frames": [*names, "lost.png"], "submaps": submaps, "joins": [], "lost": lost})
-    return folder
-
-
 @pytest.fixture
 def atlas(tmp_path):
     return write_atlas(tmp_path / "atlas")
@@ -93,8 +55,6 @@ def atlas(tmp_path):
 @pytest.fixture(scope="session")
 def folders(tmp_path_factory):
     """The folders of :mod:`tests.pipeline.reconstructions`, not to be changed."""
-    from tests.pipeline.reconstructions import write_long, write_short  # which uses this module
-
     folder = tmp_path_factory.mktemp("folders")
     return {"long": write_long(folder / "long"), "short": write_short(folder / "short")}
 

@@ -15,14 +15,21 @@ from scipy.spatial.transform import Rotation
 
 from coliags_plugin.core.files import write_json
 from coliags_plugin.core.images import write_image
+from coliags_plugin.core.scene_files import write_unit
+from coliags_plugin.datamanagers.colmap import ATLAS_FILE
+from coliags_plugin.geometry.poses.colmap import write_reconstruction
+from coliags_plugin.phantom.layouts import SeenPoints, add_points
 from coliags_plugin.pipeline.stages import Record, StageRecord
 from coliags_plugin.pipeline.steps import PICTURES, SCENE
 from coliags_plugin.pipeline.survey import Survey
 from coliags_plugin.reporting.image_files import write_png
 from coliags_plugin.results.reading import write_result
-from tests.pipeline.conftest import COUNTS, write_atlas
+from tests.reconstruction.seen_points import frame_model
 from tests.results.made import made_result, made_set
+from tests.textured_tube import tube_frames
 
+#: Frames of the models, along the video; the last is too small.
+COUNTS = (14, 12, 5)
 FRAMES, RATE = 100, 10.0
 SPANS = {"segment-000": (0, 31), "segment-001": (26, 57), "segment-002": (70, 89)}
 #: Names of the sub-maps in order, and their frames.
@@ -82,8 +89,52 @@ def video(**changes):
     return {**figures, **changes}
 
 
-def three_submaps() -> dict[str, StageRecord]:
-    """Stages of a segment of three sub-maps, one of which failed."""
+def write_atlas(folder, counts=COUNTS, units=("unknown", "unknown", "unknown"), listed=True):
+    """A scene of several models, each with a point before every camera, and the ``atlas.json`` that lists them."""
+    (folder / "images").mkdir(parents=True)
+    start, submaps, names = 0, [], []
+    for number, count in enumerate(counts):
+        frames = tube_frames(count, 1.0, (40, 32))
+        own = [f"{start + index:03d}.png" for index in range(count)]
+        for frame, name in zip(frames, own, strict=True):
+            write_image(folder / "images" / name, frame.image.numpy())
+        model = frame_model(frames, own)
+        poses = np.stack([frame.camera.camera_to_world.numpy() for frame in frames])
+        points = poses[:, :3, 3] + 2.0 * (number + 1) * poses[:, :3, 2]
+        seen = [SeenPoints(np.array([[20.0, 16.0]]), np.array([index])) for index in range(count)]
+        add_points(model, seen, points, np.zeros((count, 3), np.uint8))
+        write_reconstruction(folder / f"sparse/{number}", model)
+        stretch = {"model": f"sparse/{number}", "unit": units[number], "frames": [*range(start, start + count)]}
+        submaps.append(stretch)
+        names += own
+        start += count
+    write_unit(folder, units[0])
+    if listed:
+        lost = [{"frame": start, "reason": "blurred"}]
+        write_json(folder / ATLAS_FILE, {"frames": [*names, "lost.png"], "submaps": submaps, "joins": [], "lost": lost})
+    return folder
+
+
+def write_segment(folder: Path, first: int = 0) -> dict[str, StageRecord]:
+    """Files and stages of a segment of three sub-maps, the last of which failed."""
+    poses = write_atlas(folder / "poses")
+    names = [f"{index:03d}" for index in range(sum(COUNTS))] + ["lost"]
+    images = folder / "frames" / "images"
+    shutil.copytree(poses / "images", images)
+    write_image(images / "lost.png", np.zeros((32, 40, 3), np.uint8))
+    write_frames(folder, [{"frame": first + index, "name": name, "blurred": False} for index, name in enumerate(names)])
+    for place in ("", "submap-1/"):
+        file = folder / place / SCENE_FILE
+        file.parent.mkdir(parents=True)
+        file.write_text(f"<title>{folder.name} {place}</title>" + "x" * 2000)
+        write_json(folder / place / "depth" / "transforms.json", {"frames": []})
+    for kind in ("recorded", "depth", "flattened light"):
+        write_png(folder / FOLDER / "003" / f"{kind}.png", np.full((4, 4, 3), len(kind), np.uint8))
+    evaluation = folder / "run" / "eval" / "paper"
+    write_result(evaluation / "result.json", made_result({"test": made_set(("003", "011"), (20.0 + first, 30.0))}))
+    for kind in ("truth", "renders"):
+        for name in ("003", "011"):
+            write_png(evaluation / kind / "test" / f"{name}.png", np.full((6, 8, 3), 90, np.uint8))
     return {
         "frames": done({"frames/images": "frames of use"}),
         "poses": done({"poses": "scene"}),
@@ -103,29 +154,6 @@ def three_submaps() -> dict[str, StageRecord]:
         "submap-2/check": done(frames=5),
         "submap-2/depth": failed("no surface that 5 frames agree on. Check the poses."),
     }
-
-
-def write_segment(folder: Path, first: int = 0) -> dict[str, StageRecord]:
-    """Files of a segment: frames, poses of three models, scenes, pictures, results, depth of the first two."""
-    poses = write_atlas(folder / "poses")
-    names = [f"{index:03d}" for index in range(sum(COUNTS))] + ["lost"]
-    images = folder / "frames" / "images"
-    shutil.copytree(poses / "images", images)
-    write_image(images / "lost.png", np.zeros((32, 40, 3), np.uint8))
-    write_frames(folder, [{"frame": first + index, "name": name, "blurred": False} for index, name in enumerate(names)])
-    for place in ("", "submap-1/"):
-        file = folder / place / SCENE_FILE
-        file.parent.mkdir(parents=True)
-        file.write_text(f"<title>{folder.name} {place}</title>" + "x" * 2000)
-        write_json(folder / place / "depth" / "transforms.json", {"frames": []})
-    for kind in ("recorded", "depth", "flattened light"):
-        write_png(folder / FOLDER / "003" / f"{kind}.png", np.full((4, 4, 3), len(kind), np.uint8))
-    evaluation = folder / "run" / "eval" / "paper"
-    write_result(evaluation / "result.json", made_result({"test": made_set(("003", "011"), (20.0 + first, 30.0))}))
-    for kind in ("truth", "renders"):
-        for name in ("003", "011"):
-            write_png(evaluation / kind / "test" / f"{name}.png", np.full((6, 8, 3), 90, np.uint8))
-    return three_submaps()
 
 
 def write_frames(folder: Path, frames) -> None:

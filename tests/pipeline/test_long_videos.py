@@ -29,9 +29,8 @@ from coliags_plugin.pipeline.survey import OVERLAP, Survey, cut, survey_video
 from coliags_plugin.reporting.video import write_video
 from tests import commands
 from tests.faults import largest_file
-from tests.pipeline.conftest import write_atlas
 from tests.pipeline.films import film
-from tests.pipeline.reconstructions import JOINS, RATE, SUBMAPS, change_video, similarity
+from tests.pipeline.reconstructions import JOINS, RATE, SUBMAPS, change_video, similarity, write_atlas
 
 
 def surveyed(followed, sharpness=1.0):
@@ -67,11 +66,8 @@ def test_a_video_is_cut_where_nothing_is_seen_for_long_and_where_least_is_follow
     places = [(each.first, each.last) for each in segments]
     assert places == [(0, 299), (350, 499 + half), (500 - half, 999)] or segments[0].last == 299
     assert segments[1].last - segments[2].first + 1 == OVERLAP
-
-
-def test_the_noise_of_a_flat_wall_at_the_lens_may_be_followed_and_is_left_out():
     sharpness = np.full(400, 0.02)
-    sharpness[200:260] = 0.002
+    sharpness[200:260] = 0.002  # a flat wall at the lens, whose noise may be followed
     segments, skipped = cut(surveyed(np.full(400, 0.5), sharpness), FrameSettings(segment=300), 12)
     assert [(each.first, each.last) for each in skipped] == [(200, 259)]
     assert [(each.first, each.last) for each in segments] == [(0, 199), (260, 399)]
@@ -267,7 +263,9 @@ def test_what_the_executor_refuses_is_told_before_the_survey(long_video, tmp_pat
     assert not any((tmp_path / "out").glob("[!.]*"))
 
 
-def test_every_sub_map_is_exported_with_its_trajectory_and_the_transform_to_the_first_of_those_joined(out, tmp_path):
+def test_every_sub_map_is_exported_with_its_trajectory_and_the_transform_to_the_first_of_those_joined(
+    out, short, tmp_path
+):
     manifest = export_atlas(out, tmp_path / "export")
     assert json.loads((tmp_path / "export" / "manifest.json").read_text()) == manifest
     assert {entry["name"]: entry["frames"] for entry in manifest["submaps"]} == {
@@ -291,15 +289,12 @@ def test_every_sub_map_is_exported_with_its_trajectory_and_the_transform_to_the_
     np.testing.assert_allclose(by_name["segment-001/0"]["to_joined"], similarity(1))
     np.testing.assert_array_equal(by_name["segment-000/2"]["to_joined"], np.eye(4))
     assert [entry["reason"] for entry in manifest["joins"]] == [entry["reason"] for entry in JOINS]
-
-
-def test_a_short_video_is_exported_likewise(short, tmp_path):
-    manifest = export_atlas(short, tmp_path / "export")
+    manifest = export_atlas(short, tmp_path / "short-export")
     assert [(entry["name"], entry["folder"], entry["nerfstudio"]) for entry in manifest["submaps"]] == [
         (f"sub-map {number}", f"submap-{number}", number != 2) for number in range(3)
     ]
     assert manifest["joins"] == [] and manifest["size"] == [40, 32]
-    assert colmap.read(tmp_path / "export" / "submap-1" / "colmap" / "sparse" / "0").names
+    assert colmap.read(tmp_path / "short-export" / "submap-1" / "colmap" / "sparse" / "0").names
 
 
 def test_timestamps_are_frame_numbers_where_the_rate_is_unknown_and_those_of_frames_where_it_varies(out, tmp_path):
