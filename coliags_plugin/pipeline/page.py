@@ -15,8 +15,7 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import read_rgb
 from coliags_plugin.pipeline.contents import Contents, SubmapContents, common_frames, read_contents
 from coliags_plugin.pipeline.joins import ModelKey
-from coliags_plugin.pipeline.stages import PAGE_FILE, Record, StageRecord
-from coliags_plugin.pipeline.steps import PICTURES, SCENE
+from coliags_plugin.pipeline.stages import OUTPUTS, PAGE_FILE, Record, StageRecord
 from coliags_plugin.pipeline.timeline import (
     State,
     clock_span,
@@ -52,6 +51,8 @@ from coliags_plugin.reporting.numbers import area_text, counted, duration, lette
 _LIMIT, _SCENES = 50_000_000, 36_000_000
 #: Sub-maps whose pictures are shown, and whose held-out views are; the number of these of each, beside the worst.
 _SUBMAPS, _VIEWS = 8, 6
+#: Where the stage *scene* writes, in the folder of a sub-map.
+_SCENE, _PICTURES = OUTPUTS["scene"]
 #: Pictures of a frame, in order.
 _KINDS = ("recorded.png", "depth.png", "flattened light.png")
 #: Items named in a sentence, and sentences about what limits the result; rows of a table above which it is folded.
@@ -199,24 +200,19 @@ def _longest_first(contents: Contents) -> list[SubmapContents]:
     return sorted(contents.submaps, key=lambda submap: -len(submap.names))
 
 
-def _files_of(contents: Contents, submap: SubmapContents, kind: str) -> list[str]:
-    """Paths of what the stage *scene* has made of one kind."""
-    files = submap.stages["scene"].files if "scene" in submap.stages else {}
-    return [path for path, what in files.items() if what == kind and (contents.folder / path).exists()]
-
-
 def _scenes(contents: Contents) -> Iterator[Block]:
     """The scenes to fly through, the longest sub-maps first: within the page as far as there is room."""
     scenes, room = list[tuple[str, str, str | None]](), _SCENES
     for submap in _longest_first(contents):
+        path, page = Path(submap.folder, _SCENE), None
+        if not (file := contents.folder / path).is_file():
+            continue
+        if file.stat().st_size <= room:
+            page = file.read_text(encoding="utf-8")
+            size = len(escape(page).encode())
+            room, page = (room - size, page) if size <= room else (room, None)
         times = clock_span(contents, submap.first, submap.last) if submap.names else ""
-        for path in _files_of(contents, submap, SCENE):
-            page: str | None = None
-            if (contents.folder / path).stat().st_size <= room:
-                page = (contents.folder / path).read_text(encoding="utf-8")
-                size = len(escape(page).encode())
-                room, page = (room - size, page) if size <= room else (room, None)
-            scenes.append((", ".join(filter(None, (submap.name, times))), quote(path), page))
+        scenes.append((", ".join(filter(None, (submap.name, times))), quote(path.as_posix()), page))
     if any(page is None for _, _, page in scenes):
         yield Paragraph("The longest sub-maps are within this page, others are loaded from the folder it lies in.")
     if scenes:
@@ -225,16 +221,14 @@ def _scenes(contents: Contents) -> Iterator[Block]:
 
 def _pictures(contents: Contents) -> Iterator[Block]:
     """Frames, their depth and the wall in flattened light, side by side, of the longest sub-maps."""
-    longest = _longest_first(contents)[:_SUBMAPS]
-    for submap in longest:
-        for path in _files_of(contents, submap, PICTURES):
-            scale = submap.figures.get("depth_scale")
-            blocks: list[Block] = [Paragraph(f"Colours: {scale}, dark is near.")] if scale else []
-            for frame in sorted((contents.folder / path).iterdir()):
-                files = [file for kind in _KINDS for file in frame.glob(kind)]
-                images = [Image(EncodedImage.png(read_rgb(file)), file.stem) for file in files]
-                blocks.append(Figures(images, frame.name))
-            yield Folded(submap.name, blocks, is_open=submap is longest[0])
+    for index, submap in enumerate(_longest_first(contents)[:_SUBMAPS]):
+        scale = submap.figures.get("depth_scale")
+        blocks: list[Block] = [Paragraph(f"Colours: {scale}, dark is near.")] if scale else []
+        for frame in sorted(contents.folder.joinpath(submap.folder, _PICTURES).glob("*")):
+            files = [file for kind in _KINDS for file in frame.glob(kind)]
+            blocks.append(Figures([Image(EncodedImage.png(read_rgb(file)), file.stem) for file in files], frame.name))
+        if blocks:
+            yield Folded(submap.name, blocks, is_open=index == 0)
 
 
 def _views(contents: Contents) -> list[Section]:

@@ -34,8 +34,6 @@ if TYPE_CHECKING:
 _MOST = 0.7
 #: Largest time between two checkpoints, seconds, and the number of checkpoints kept.
 _SAVE_SECONDS, _KEPT = 60.0, 2
-#: What the results are that the page shows: of scenes, and of frames beside depth and flattened light.
-SCENE, PICTURES = "the scene to fly through: Gaussians, surface, coverage", "frames, depth, flattened light"
 #: Largest page of a scene: of the largest sub-map and of others. Its Gaussians are fitted for as many steps as
 #: were trained, but so many at most; not for a time, so that it is the same whatever machine made it.
 _PAGES, _MOST_FIT_STEPS = {True: "10MB", False: "4MB"}, 2000
@@ -438,7 +436,8 @@ def show(context: StageContext) -> StageRecord:
     depth_scale = _write_pictures(trained, context.run / "pictures")
     size, steps = _PAGES[context.folder == context.out], min(trained.step, _MOST_FIT_STEPS)
     page = save_page(trained, PageOptions(size=size, seconds=math.inf), steps)
-    files = {"run/scene.html": SCENE, "run/pictures": PICTURES}
+    what = "the scene to fly through: Gaussians, surface, coverage"
+    files = {"run/scene.html": what, "run/pictures": "frames, depth, flattened light"}
     return StageRecord(page.text, files, figures={"depth_scale": depth_scale})
 
 

@@ -20,7 +20,6 @@ from coliags_plugin.datamanagers.colmap import ATLAS_FILE
 from coliags_plugin.geometry.poses.colmap import write_reconstruction
 from coliags_plugin.phantom.layouts import SeenPoints, add_points
 from coliags_plugin.pipeline.stages import Record, StageRecord
-from coliags_plugin.pipeline.steps import PICTURES, SCENE
 from coliags_plugin.pipeline.survey import Survey
 from coliags_plugin.reporting.image_files import write_png
 from coliags_plugin.results.reading import write_result
@@ -142,14 +141,14 @@ def write_segment(folder: Path, first: int = 0) -> dict[str, StageRecord]:
         "train": done(steps=2000),
         "evaluate": done({"run/eval/paper": "metrics"}, psnr=24.0, ssim=0.85, held_out=2, psnr_training=27.5),
         "mesh": done(area=4200.0, unit="mm"),
-        "scene": done({SCENE_FILE: SCENE, FOLDER: PICTURES}),
+        "scene": done({SCENE_FILE: "scene", FOLDER: "pictures"}),
         "coverage": done(seen=0.625),
         "report": done(),
         "submap-1/check": done({"submap-1/check.html": "check"}, frames=12),
         "submap-1/train": done(steps=500),
         "submap-1/evaluate": done(psnr=22.0, ssim=0.8, held_out=2, psnr_training=23.5, psnr_pose_refined=23.0),
         "submap-1/mesh": done(area=900.0, unit="units"),
-        "submap-1/scene": done({f"submap-1/{SCENE_FILE}": SCENE}),
+        "submap-1/scene": done({f"submap-1/{SCENE_FILE}": "scene"}),
         "submap-1/coverage": done(seen_area=800.0),
         "submap-2/check": done(frames=5),
         "submap-2/depth": failed("no surface that 5 frames agree on. Check the poses."),
