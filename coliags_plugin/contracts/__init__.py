@@ -1,7 +1,5 @@
 """Base classes of all kinds of components, which component packages implement without importing one another."""
 
-from coliags_plugin.contracts.data import DataManager
-from coliags_plugin.contracts.evaluation import Comparison, Metric, Protocol
 from coliags_plugin.contracts.fields import (
     AppearanceHead,
     Field,
@@ -15,6 +13,7 @@ from coliags_plugin.contracts.fields import (
     SeenAnchors,
 )
 from coliags_plugin.contracts.rendering import Availability, Renderer, ViewModule
+from coliags_plugin.contracts.scenes import Comparison, DataManager, Metric, Protocol
 from coliags_plugin.contracts.schedule import Schedule, log_linear, steps_text
 from coliags_plugin.contracts.training import (
     Draw,

@@ -12,27 +12,14 @@ MAX_DEGREE = 3
 #: Y_0, by which a colour becomes a coefficient of degree 0.
 Y0 = 0.5 / math.sqrt(math.pi)
 
-#: Factors of the polynomials in :func:`basis`, of the functions of degrees 1 to 3 in turn.
-FACTORS = tuple(
-    sign * math.sqrt(value / math.pi)
-    for sign, value in (
-        (-1.0, 3 / 4),
-        (1.0, 3 / 4),
-        (-1.0, 3 / 4),
-        (1.0, 15 / 4),
-        (-1.0, 15 / 4),
-        (1.0, 5 / 16),
-        (-1.0, 15 / 4),
-        (1.0, 15 / 16),
-        (-1.0, 35 / 32),
-        (1.0, 105 / 4),
-        (-1.0, 21 / 32),
-        (1.0, 7 / 16),
-        (-1.0, 21 / 32),
-        (1.0, 105 / 16),
-        (-1.0, 35 / 32),
-    )
+# Squares of the factors times pi, with the factors' signs, of degrees 1 to 3.
+_SQUARES = (
+    *(-3 / 4, 3 / 4, -3 / 4),
+    *(15 / 4, -15 / 4, 5 / 16, -15 / 4, 15 / 16),
+    *(-35 / 32, 105 / 4, -21 / 32, 7 / 16, -21 / 32, 105 / 16, -35 / 32),
 )
+#: Factors of the polynomials in :func:`basis`.
+FACTORS = tuple(math.copysign(math.sqrt(abs(square) / math.pi), square) for square in _SQUARES)
 
 
 def basis(directions: Float[Tensor, "N 3"], degree: int) -> Float[Tensor, "N B"]:

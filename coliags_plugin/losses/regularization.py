@@ -116,9 +116,7 @@ class SmoothGainLoss(Loss[SmoothGainSettings]):
         return (2.0 * bends / (gaps[1:] + gaps[:-1])).mean()
 
 
-def depth_normals(
-    depth: Float[Tensor, "H W"], camera: Camera, is_known: Bool[Tensor, "H W"] | None = None
-) -> Float[Tensor, "H W 3"]:
+def depth_normals(depth: Float[Tensor, "H W"], camera: Camera, is_known: Bool[Tensor, "H W"]) -> Float[Tensor, "H W 3"]:
     """Unit normals in camera axes, facing the camera: cross products of central differences of unprojected pixels.
 
     0 at the border, and where a neighbour above, below, to the left or to the right of the z-depth is unknown.
@@ -133,11 +131,8 @@ def depth_normals(
     down = points[2:, 1:-1] - points[:-2, 1:-1]
     right = points[1:-1, 2:] - points[1:-1, :-2]
     normals = torch.nn.functional.normalize(torch.linalg.cross(down, right), dim=-1)
-    if is_known is not None:
-        normals = zero_outside(
-            normals, is_known[2:, 1:-1] & is_known[:-2, 1:-1] & is_known[1:-1, 2:] & is_known[1:-1, :-2]
-        )
-    return torch.nn.functional.pad(normals, (0, 0, 1, 1, 1, 1))
+    beside = is_known[2:, 1:-1] & is_known[:-2, 1:-1] & is_known[1:-1, 2:] & is_known[1:-1, :-2]
+    return torch.nn.functional.pad(zero_outside(normals, beside), (0, 0, 1, 1, 1, 1))
 
 
 def _drawn_channel(step: TrainingStep, channel: str) -> Float[Tensor, "N C"]:

@@ -129,7 +129,7 @@ class AdaptiveDensity(Strategy[AdaptiveDensitySettings]):
         born["scales"][parts] -= math.log(_SPLIT_SHRINK)
         rows.add_rows(born)
         field.rows_added(born["means"], parents)
-        self._extend(len(parents))
+        self.load_state_dict({name: _extended(value, len(parents)) for name, value in self.state_dict().items()})
         keep = torch.ones(len(field.means), dtype=torch.bool, device=field.means.device)
         keep[splits] = False
         self._keep(field, rows, keep)
@@ -158,11 +158,6 @@ class AdaptiveDensity(Strategy[AdaptiveDensitySettings]):
             return 0  # at 0 too: an empty field could not recover
         self._keep(field, rows, ~gone)
         return int(gone.sum())
-
-    def _extend(self, count: int) -> None:
-        self.load_state_dict(
-            {name: torch.cat([value, value.new_zeros(count)]) for name, value in self.state_dict().items()}
-        )
 
     def _keep(self, field: Any, rows: ParameterRows, keep: Tensor) -> None:
         if keep.all():
@@ -244,8 +239,7 @@ class AnchorGrowth(Strategy[AnchorGrowthSettings]):
         """Extend the counters to new anchors."""
         for name, per_anchor in zip(self.counters, (1, 1, children, children), strict=True):
             values = getattr(self, name).to(device)
-            missing = anchors * per_anchor - len(values)
-            setattr(self, name, torch.cat([values, values.new_zeros(missing)]) if missing else values)
+            setattr(self, name, _extended(values, anchors * per_anchor - len(values)))
 
     def _count(self, output: RenderOutput, children: int) -> None:
         gaussians, lengths = output.drawn.gaussians, output.gradient_lengths
@@ -333,3 +327,8 @@ def one_per_free_cell(
     first = torch.full((len(cells),), len(order), device=cells.device)
     first.scatter_reduce_(0, member_of[order], torch.arange(len(order), device=cells.device), "amin")
     return order[first[first < len(order)].sort().values[:limit]]
+
+
+def _extended(values: Tensor, count: int) -> Tensor:
+    """Counters with zeros of further rows."""
+    return torch.cat([values, values.new_zeros(count)])

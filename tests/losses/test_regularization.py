@@ -41,7 +41,7 @@ def test_normals_of_a_plane_are_exact(normal):
     camera = off_centre()
     depth = -5.0 / (camera.rays() @ normal)  # n . z r = -5: the plane is seen from its front
     assert (depth > 0).all()
-    gradients = depth_normals(depth, dataclasses.replace(camera, camera_to_world=rigid(3)[0]))
+    gradients = depth_normals(depth, dataclasses.replace(camera, camera_to_world=rigid(3)[0]), depth > 0)
     torch.testing.assert_close(gradients[1:-1, 1:-1], normal.expand(15, 21, 3))
     border = gradients.clone()
     border[1:-1, 1:-1] = 0
@@ -57,7 +57,7 @@ def test_normals_of_a_sphere_converge_to_the_second_order(pixels, bound):
     along, squared = (rays * centre).sum(-1), rays.square().sum(-1)
     depth = (along + torch.sqrt(along**2 - squared * (centre @ centre - radius**2))) / squared
     true = (centre - camera.unproject(depth)) / radius
-    error = (depth_normals(depth, camera) - true)[1:-1, 1:-1].norm(dim=-1)
+    error = (depth_normals(depth, camera, depth > 0) - true)[1:-1, 1:-1].norm(dim=-1)
     assert error.max() < bound
 
 
@@ -66,7 +66,7 @@ def test_unknown_depths_reach_their_neighbours_only():
     spoiled, known = depth.clone(), torch.ones(17, 23, dtype=torch.bool)
     spoiled[8, 10], known[8, 10] = torch.nan, False
     spoiled.requires_grad_()
-    gradients, whole = depth_normals(spoiled, camera, known), depth_normals(depth, camera)
+    gradients, whole = depth_normals(spoiled, camera, known), depth_normals(depth, camera, depth > 0)
     beside = torch.zeros_like(known)
     beside[[7, 9, 8, 8], [10, 10, 9, 11]] = True
     assert not gradients[beside].any()
@@ -77,7 +77,8 @@ def test_unknown_depths_reach_their_neighbours_only():
 
 @pytest.mark.parametrize("size", [(1, 1), (2, 5), (5, 2), (3, 3)])
 def test_maps_too_small_for_differences_have_no_normals(size):
-    gradients = depth_normals(torch.ones(size), Camera(5.0, 5.0, 1.0, 1.0, size[1], size[0], torch.eye(4)))
+    camera = Camera(5.0, 5.0, 1.0, 1.0, size[1], size[0], torch.eye(4))
+    gradients = depth_normals(torch.ones(size), camera, torch.ones(size, dtype=torch.bool))
     assert gradients.shape == (*size, 3)
     assert gradients.any() == (size == (3, 3))
 
