@@ -88,21 +88,6 @@ class PreparedPhantom:
         """Poses of the frames that are not held out."""
         return list(self.poses[: self.settings.frames][self.is_training])
 
-    @property
-    def given_poses(self) -> Float[np.ndarray, "N 4 4"]:
-        """Poses of the images that methods are given, with the errors of a tracker."""
-        if not any(self.settings.pose_noise):
-            return self.poses
-        drift = pose_errors(self.settings, np.zeros(self.settings.frames, bool))
-        errors = [pose_errors(self.settings, self.is_training), drift[self.frames[self.settings.frames :]]]
-        return displaced(self.poses, np.concatenate(errors))
-
-    def given_depth(self, z_depth: Float[np.ndarray, "H W"], number: int) -> Float[np.ndarray, "H W"]:
-        """The depth of image ``number`` that methods are given, from the true one: training frames' has errors."""
-        if not self.settings.depth_noise or number >= self.settings.frames or self.layout.is_test(number):
-            return z_depth
-        return estimated_depth(z_depth, self.settings, number)
-
     def world_at(self, number: int) -> World:
         """The world as it is in image ``number``."""
         frame = self.frames[number]
@@ -235,8 +220,8 @@ def generate(
 
 
 def _write(phantom: PreparedPhantom, folder: Path, report: Progress) -> None:
-    layout, lens, frames, total = phantom.layout, phantom.sensor.lens, phantom.settings.frames, len(phantom.poses)
-    training = phantom.is_training
+    settings, layout, lens, total = phantom.settings, phantom.layout, phantom.sensor.lens, len(phantom.poses)
+    frames, training = settings.frames, phantom.is_training
     # Coverage as C3VD counts it: triangles that are the first hit of any pixel ray of any frame.
     observed = np.zeros(len(phantom.world.surface.triangles), bool)
     trained_on = np.zeros_like(observed)
@@ -247,11 +232,13 @@ def _write(phantom: PreparedPhantom, folder: Path, report: Progress) -> None:
         image = phantom.sensor.image
         part: Part = "video" if number < frames else "rotation"
         index = number if part == "video" else number - frames
-        z_depth = phantom.given_depth(image(exposure.z_depth), number)
+        z_depth = image(exposure.z_depth)
+        if settings.depth_noise and part == "video" and training[index]:
+            z_depth = estimated_depth(z_depth, settings, index)
         layout.write_frame(folder, PhantomFrame(part, index, image(color), z_depth))
         if phantom.motion is not None and part == "video":
             fits.append(_to_rest(phantom, exposure, number))
-        if phantom.settings.covers and part == "video":
+        if settings.covers and part == "video":
             write_image(folder / "truth" / "not_wall" / f"{index:04d}.png", image(exposure.cover))
         if part == "video":
             observed[exposure.triangles] = True
@@ -263,7 +250,10 @@ def _write(phantom: PreparedPhantom, folder: Path, report: Progress) -> None:
             mask = image(_seen_mask(phantom, exposure, number))
             write_image(layout.seen_mask(folder, part, index), mask)
         report("frames", number + 1, total)
-    poses = phantom.given_poses
+    poses = phantom.poses
+    if any(settings.pose_noise):  # as a tracker would give them
+        drift = pose_errors(settings, np.zeros(frames, bool))[phantom.frames[frames:]]
+        poses = displaced(poses, np.concatenate([pose_errors(settings, training), drift]))
     layout.write_sequence(folder, "video", poses[:frames], lens)
     if phantom.rotation_views:
         layout.write_sequence(folder, "rotation", poses[frames:], lens)
@@ -272,9 +262,7 @@ def _write(phantom: PreparedPhantom, folder: Path, report: Progress) -> None:
         points = WallPoints(positions, colors, lambda index: phantom.seen(positions, [phantom.poses[index]]))
         layout.write_points(folder, points, poses[:frames], lens)
     report("truth", 0, 1)
-    _write_truth(phantom, folder / "truth", trained_on, observed)
-    if phantom.motion is not None:
-        _write_motion(phantom, phantom.motion, folder / "truth", fits)
+    _write_truth(phantom, folder / "truth", trained_on, observed, fits)
     report("truth", 1, 1)
 
 
@@ -311,9 +299,13 @@ def _draw_points(
 
 
 def _write_truth(
-    phantom: PreparedPhantom, folder: Path, trained_on: Bool[np.ndarray, "F"], observed: Bool[np.ndarray, "F"]
+    phantom: PreparedPhantom,
+    folder: Path,
+    trained_on: Bool[np.ndarray, "F"],
+    observed: Bool[np.ndarray, "F"],
+    fits: Sequence[tuple[Float[np.ndarray, "4 4"], float]],
 ) -> None:
-    surface, settings = phantom.world.surface, phantom.settings
+    surface, settings, motion = phantom.world.surface, phantom.settings, phantom.motion
     folder.mkdir(parents=True, exist_ok=True)
     albedo = vertex_albedo(surface, phantom.world.mucosa)
     _write_mesh(folder / "mesh.ply", surface, albedo)
@@ -347,6 +339,12 @@ def _write_truth(
     if settings.color_matrix != SAME_COLORS:
         light["color_matrix"] = settings.color_matrix
     write_json(folder / "light.json", light)
+    if motion is not None:
+        relative, residuals = zip(*fits, strict=True)
+        np.save(folder / "camera_to_wall.npy", np.stack(relative))
+        displacement = {"radial": motion.radial, "wave_mm": motion.wave, "shift_mm": motion.shift}
+        times = {"time_s": frame_times(settings), "residual_mm": np.array(residuals)}
+        write_arrays(folder / "wall_motion.npz", displacement | times)
 
 
 def _to_rest(phantom: PreparedPhantom, exposure: Exposure, number: int) -> tuple[Float[np.ndarray, "4 4"], float]:
@@ -359,16 +357,6 @@ def _to_rest(phantom: PreparedPhantom, exposure: Exposure, number: int) -> tuple
     relative = pose.copy()
     relative[:3, :3], relative[:3, 3] = fit.rotation @ pose[:3, :3], fit.points(pose[None, :3, 3])[0]
     return relative, float(np.sqrt(((fit.points(moved) - at_rest) ** 2).sum(axis=1).mean()))
-
-
-def _write_motion(
-    phantom: PreparedPhantom, motion: WallMotion, folder: Path, fits: Sequence[tuple[Float[np.ndarray, "4 4"], float]]
-) -> None:
-    relative, residuals = zip(*fits, strict=True)
-    np.save(folder / "camera_to_wall.npy", np.stack(relative))
-    times = frame_times(phantom.settings)
-    displacement = {"radial": motion.radial, "wave_mm": motion.wave, "shift_mm": motion.shift}
-    write_arrays(folder / "wall_motion.npz", {**displacement, "time_s": times, "residual_mm": np.array(residuals)})
 
 
 def vertex_albedo(surface: ColonSurface, mucosa: Mucosa) -> Float[np.ndarray, "V 3"]:

@@ -217,14 +217,6 @@ _PEAK, _IGNORED = 0.9, 2.0
 _CENTRE = 0.18
 
 
-def encode(linear: Float[np.ndarray, "..."], gamma: float, knee: float = KNEE) -> Float[np.ndarray, "..."]:
-    """Linear light to pixel values in [0, 1): a power law with a soft shoulder above the linear level ``knee``."""
-    linear = np.maximum(linear, 0.0)
-    room = 1.0 - knee
-    bent = np.where(linear > knee, 1.0 - room * np.exp(np.minimum(knee - linear, 0.0) / room), linear)
-    return np.asarray(bent ** (1.0 / gamma))
-
-
 def exposure_for(
     radiance: Float[np.ndarray, "N 3"], settings: PhantomSettings, weights: Float[np.ndarray, "N"] | None = None
 ) -> float:
@@ -266,7 +258,10 @@ def encoded(linear: Float[np.ndarray, "N 3"], settings: PhantomSettings) -> Floa
     """The camera's response: colour matrix, shoulder, gamma and S-curve; from linear light to values in [0, 1)."""
     if settings.color_matrix != SAME_COLORS:
         linear = linear @ np.asarray(settings.color_matrix, linear.dtype).T
-    value = encode(linear, settings.gamma)
+    linear = np.maximum(linear, 0.0)
+    room = 1.0 - KNEE
+    bent = np.where(linear > KNEE, 1.0 - room * np.exp(np.minimum(KNEE - linear, 0.0) / room), linear)
+    value = np.asarray(bent ** (1.0 / settings.gamma))
     if settings.s_curve:
         value += settings.s_curve * (smoothstep(value) - value)
     return value

@@ -61,11 +61,6 @@ def poses_during(
     return list(poses_between(poses, frame + shutter * ((np.arange(count) + 0.5) / count - 0.5)))
 
 
-def times(settings: PhantomSettings) -> Float[np.ndarray, "T"]:
-    """Time of every frame along the path, from 0 to 1, in even steps."""
-    return np.linspace(0.0, 1.0, settings.frames)
-
-
 def rotation(yaw: float, pitch: float, roll: float) -> Float[np.ndarray, "3 3"]:
     """Rotation right by yaw, then up by pitch, then clockwise by roll; radians, camera axes."""
     return np.asarray(
@@ -150,27 +145,11 @@ _MIDDLE = (2.0, 4.0)
 _FAR_ANGLES = np.arange(0.0, 36.0, 2.0)
 
 
-@dataclass(frozen=True)
-class _Withdrawal:
-    """The motion without its approaches: along the centre line, drifting sideways between them."""
-
-    centre_line: CentreLine
-    length: float  # mm of arc
-    most: float  # largest offset along each of the two across directions, mm
-    drift: tuple[Curve, Curve]  # curve of each offset, of amplitude 1
-
-    def at(self, time: Float[np.ndarray, "T"]) -> tuple[Float[np.ndarray, "T 3"], Float[np.ndarray, "T 3 3"]]:
-        """Positions, world, mm, and frames of the centre line there."""
-        arc = resting(SHALLOW_END + self.length * np.linspace(1.0, 0.0, 2 * APPROACHES + 1)[:, None], time)[:, 0]
-        points, frames = self.centre_line.at(arc)
-        sideways = self.most * np.stack([curve(time) for curve in self.drift], axis=1)
-        sideways *= (1.0 - nearness(time))[:, None]
-        return shifted(points, frames, sideways), frames
-
-
 #: A near stop in the centre line's frame: the camera's offset from the withdrawal, mm, and the rotation vector from the
 #: centre line's direction to the spot's, radians.
 _Spot = tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]
+#: The motion without its approaches: positions, world, mm, and frames of the centre line at times from 0 to 1.
+_Withdrawn = Callable[[Float[np.ndarray, "T"]], tuple[Float[np.ndarray, "T 3"], Float[np.ndarray, "T 3 3"]]]
 
 
 def inspecting_path(centre_line: CentreLine, settings: PhantomSettings, tracer: Tracer) -> Float[np.ndarray, "T 4 4"]:
@@ -178,18 +157,25 @@ def inspecting_path(centre_line: CentreLine, settings: PhantomSettings, tracer: 
     generator = stream(settings.seed, Purpose.TRAJECTORY)
     drift = draw_sway(generator), draw_sway(generator)
     roll = draw_sway(generator)
-    withdrawal = _Withdrawal(centre_line, settings.path_length, settings.light_preset.wobble[1], drift)
-    spots = _choose_spots(withdrawal, tracer, settings.seed, generator)
+    stops = SHALLOW_END + settings.path_length * np.linspace(1.0, 0.0, 2 * APPROACHES + 1)[:, None]
+
+    def withdrawn(time: Float[np.ndarray, "T"]) -> tuple[Float[np.ndarray, "T 3"], Float[np.ndarray, "T 3 3"]]:
+        points, frames = centre_line.at(resting(stops, time)[:, 0])
+        sideways = settings.light_preset.wobble[1] * np.stack([curve(time) for curve in drift], axis=1)
+        sideways *= (1.0 - nearness(time))[:, None]
+        return shifted(points, frames, sideways), frames
+
+    spots = _choose_spots(withdrawn, tracer, settings.seed, generator)
 
     shifts, turns = np.zeros((2, 2 * APPROACHES + 1, 3))
     shifts[1::2], turns[1::2] = zip(*spots, strict=True)
     turns[::2] = [
-        _far_turn(withdrawal, number / APPROACHES, turns[1::2][max(number - 1, 0) : number + 1], tracer)
+        _far_turn(withdrawn, number / APPROACHES, turns[1::2][max(number - 1, 0) : number + 1], tracer)
         for number in range(APPROACHES + 1)
     ]
 
-    time = times(settings)
-    points, frames = withdrawal.at(time)
+    time = np.linspace(0.0, 1.0, settings.frames)
+    points, frames = withdrawn(time)
     rolls = np.radians(settings.light_preset.turn[2]) * roll(time)
     rotations = frames @ _matrices(resting(turns, time)) @ _matrices(rolls[:, None] * np.array([0.0, 0.0, 1.0]))
     return rigid(rotations, shifted(points, frames, resting(shifts, time)))
@@ -208,7 +194,7 @@ def nearness(time: Float[np.ndarray, "T"]) -> Float[np.ndarray, "T"]:
     return resting((np.arange(2 * APPROACHES + 1) % 2.0)[:, None], time)[:, 0]
 
 
-def _choose_spots(withdrawal: _Withdrawal, tracer: Tracer, seed: int, generator: np.random.Generator) -> list[_Spot]:
+def _choose_spots(withdrawn: _Withdrawn, tracer: Tracer, seed: int, generator: np.random.Generator) -> list[_Spot]:
     """The spots to inspect: by turns around the lumen, and otherwise random."""
     spots = []
     clock = generator.uniform(0.0, 2.0 * np.pi)
@@ -217,7 +203,7 @@ def _choose_spots(withdrawal: _Withdrawal, tracer: Tracer, seed: int, generator:
             # More and more of the circumference is tried.
             tried = clock + generator.uniform(-1.0, 1.0) * min(0.3 + 0.1 * draw, np.pi)
             turn = np.radians(generator.uniform(*_SPOT_ANGLE)) * square_to(tried)
-            spot = _approach(withdrawal, number, turn, tracer)
+            spot = _approach(withdrawn, number, turn, tracer)
             if spot is not None:
                 break
         else:
@@ -231,11 +217,11 @@ def _choose_spots(withdrawal: _Withdrawal, tracer: Tracer, seed: int, generator:
     return spots
 
 
-def _approach(withdrawal: _Withdrawal, number: int, turn: Float[np.ndarray, "3"], tracer: Tracer) -> _Spot | None:
+def _approach(withdrawn: _Withdrawn, number: int, turn: Float[np.ndarray, "3"], tracer: Tracer) -> _Spot | None:
     """The near stop on the way to the spot that lies in a direction; None where something else is in the way."""
     away = _matrices(turn) @ np.array([0.0, 0.0, 1.0])
     time = (number + np.linspace(0.0, 1.0, _TESTED)) / APPROACHES
-    points, frames = withdrawal.at(time)
+    points, frames = withdrawn(time)
     middle = _TESTED // 2
     to_spot = float(_distances(points[middle], frames[middle], away[None], tracer)[0])
     if not np.isfinite(to_spot):
@@ -250,10 +236,10 @@ def _approach(withdrawal: _Withdrawal, number: int, turn: Float[np.ndarray, "3"]
 
 
 def _far_turn(
-    withdrawal: _Withdrawal, time: float, neighbours: Float[np.ndarray, "N 3"], tracer: Tracer
+    withdrawn: _Withdrawn, time: float, neighbours: Float[np.ndarray, "N 3"], tracer: Tracer
 ) -> Float[np.ndarray, "3"]:
     """Rotation vector of a far stop: the one nearest to its neighbours' of those whose wall is about 60 mm away."""
-    (point,), (frame,) = withdrawal.at(np.array([time]))
+    (point,), (frame,) = withdrawn(np.array([time]))
     clocks = np.arange(24) * (np.pi / 12.0)
     turns = np.array([angle * square_to(clock) for angle in np.radians(_FAR_ANGLES) for clock in clocks])
     around = [angle * square_to(clock) for angle in np.radians(_MIDDLE) for clock in clocks[::3]]
@@ -304,7 +290,7 @@ def examining_path(
 ) -> Float[np.ndarray, "T 4 4"]:
     """Camera-to-world pose of every frame, OpenCV axes, mm; ``touch`` measures clearance in the wall of a frame."""
     generator = stream(settings.seed, Purpose.TRAJECTORY)
-    seconds, share = settings.frames / settings.frame_rate, times(settings)
+    seconds, share = settings.frames / settings.frame_rate, np.linspace(0.0, 1.0, settings.frames)
     slow = np.stack([draw_sway(generator, _SLOW * seconds)(share) for _ in range(3)], axis=1)
     quick = np.stack([draw_sway(generator, _QUICK * seconds)(share) for _ in range(3)], axis=1)
     arc = SHALLOW_END + _BACK + settings.path_length * (1.0 - share) + _BACK * slow[:, 0]
@@ -322,8 +308,11 @@ def examining_path(
     for number, event in enumerate(events):
         middle = (number + generator.uniform(0.35, 0.65)) / len(events) * seconds
         clock = generator.uniform(0.0, 2.0 * np.pi)
-        stages = _FAST_TIMES if event == "turn" else _CONTACT_TIMES
-        swing = _swing(frame_times(settings) - middle, stages)
+        there, stay, back = _FAST_TIMES if event == "turn" else _CONTACT_TIMES
+        time = frame_times(settings) - middle
+        # 0, then 1 while it stays, whose middle is time 0, then 0.
+        x = np.minimum((time + 0.5 * stay + there) / there, (0.5 * stay + back - time) / back)
+        swing = quintic(np.clip(x, 0.0, 1.0))
         angle = generator.uniform(*_FAST_TURN) if event == "turn" else _CONTACT_TURN
         frame = min(round(middle * settings.frame_rate), settings.frames - 1)
         aside = poses[frame, :3, :3] @ np.array([np.cos(clock), np.sin(clock), 0.0])
@@ -345,13 +334,6 @@ def _permitted(
     low = _farthest(lambda share: clearance(points + share[:, None] * sideways) > nearest, np.ones(len(points)), 12)
     width = max(round(0.4 * settings.frame_rate), 1)
     return np.asarray(scipy.ndimage.gaussian_filter1d(scipy.ndimage.minimum_filter1d(low, 2 * width + 1), 0.5 * width))
-
-
-def _swing(time: Float[np.ndarray, "T"], stages: tuple[float, float, float]) -> Float[np.ndarray, "T"]:
-    """0, then 1 during the second stage, whose middle is time 0, then 0; Perlin's quintic between."""
-    there, stay, back = stages
-    x = np.clip(np.minimum((time + 0.5 * stay + there) / there, (0.5 * stay + back - time) / back), 0.0, 1.0)
-    return quintic(x)
 
 
 def _reach(
@@ -449,7 +431,7 @@ def _withdrawing_path(centre_line: CentreLine, settings: PhantomSettings, tracer
     """Poses of the trajectories ``pullback`` and ``rotation``: along the centre line, and almost in place."""
     generator = stream(settings.seed, Purpose.TRAJECTORY)
     preset = settings.light_preset
-    time = times(settings)
+    time = np.linspace(0.0, 1.0, settings.frames)
     if settings.trajectory == "pullback":
         arc = SHALLOW_END + settings.path_length * (1.0 - time)
     else:

@@ -28,7 +28,6 @@ from coliags_plugin.geometry.meshes.truth import (
 )
 from coliags_plugin.reporting.image_files import write_png
 from coliags_plugin.reporting.model import Block, Paragraph, simple_table
-from coliags_plugin.surface.meshing.mending import close_holes, smoothed
 from coliags_plugin.surface.meshing.pictures import comparison_picture, distance_colors
 from coliags_plugin.surface.meshing.views import (
     DepthView,
@@ -39,7 +38,7 @@ from coliags_plugin.surface.meshing.views import (
     rendered_depth,
     voxel_size_of,
 )
-from coliags_plugin.surface.meshing.volume import Volume
+from coliags_plugin.surface.meshing.volume import Volume, close_holes, smoothed
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,9 +13,8 @@ from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.geometry.meshes.mesh import TriangleMesh
 from coliags_plugin.geometry.meshes.truth import angles_between
-from coliags_plugin.surface.meshing.mending import close_holes, loops, smoothed
 from coliags_plugin.surface.meshing.views import DepthView, best_colors
-from coliags_plugin.surface.meshing.volume import Volume, _in_order
+from coliags_plugin.surface.meshing.volume import Volume, _in_order, close_holes, loops, smoothed
 from tests.scenes import camera_at
 from tests.surface.coverage.tubes import joined, plane
 
