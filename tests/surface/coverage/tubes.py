@@ -6,6 +6,7 @@ import numpy as np
 
 from coliags_plugin.geometry.lenses.models import PinholeLens
 from coliags_plugin.geometry.meshes.mesh import TriangleMesh
+from coliags_plugin.phantom.colon import grid_triangles
 from coliags_plugin.surface.coverage.visibility import CoverageView
 
 
@@ -29,14 +30,7 @@ def view_at(center, forward=(0.0, 0.0, 1.0), lens=None, name="frame", grey=None,
 
 def grid_mesh(points: np.ndarray, around: bool = False) -> TriangleMesh:
     """The mesh of an R x C grid of points, whose columns close a ring if ``around``."""
-    rows, columns = points.shape[:2]
-    row, column = np.meshgrid(np.arange(rows - 1), np.arange(columns if around else columns - 1), indexing="ij")
-    row, column = row.ravel(), column.ravel()
-    beside = (column + 1) % columns
-    a, b = row * columns + column, (row + 1) * columns + column
-    c, d = row * columns + beside, (row + 1) * columns + beside
-    triangles = np.stack([np.stack([a, b, c], axis=1), np.stack([d, c, b], axis=1)], axis=1).reshape(-1, 3)
-    return TriangleMesh(points.reshape(-1, 3), triangles)
+    return TriangleMesh(points.reshape(-1, 3), grid_triangles(*points.shape[:2], wraps=around).astype(np.int64))
 
 
 def tube(radius=10.0, start=-20.0, end=80.0, spacing=1.0, columns=72) -> TriangleMesh:

@@ -57,22 +57,28 @@ def test_pixel_centres():
     assert abs((local[:, 2] + 0.3 * local[:, 0]).mean() - 20.0) < 0.015
 
 
-def test_places_of_few_views_are_left_out():
-    camera, depth = turned(0.0), torch.full((90, 120), 20.0)
-    right = depth * (torch.arange(120) >= 60)
-    assert len(Volume([view_of(camera, torch.zeros_like(depth))], 0.5, 4.0).mesh(1, 0.0)) == 0
-    volume = Volume([view_of(camera, depth), view_of(camera, right)], 0.5, 4.0)
-    assert volume.mesh(1, 0.0).areas.sum() == pytest.approx(2 * volume.mesh(2, 0.0).areas.sum(), rel=0.1)
-    assert len(volume.mesh(3, 0.0)) == 0
+RIGHT = torch.arange(120) >= 60
 
 
-def test_places_of_little_support_are_left_out():
-    camera, depth = turned(0.0), torch.full((90, 120), 20.0)
-    quality = torch.where(torch.arange(120) >= 60, 1.0, 0.5).expand(90, 120)
-    volume = Volume([view_of(camera, depth, quality)] * 2, 0.5, 4.0)
-    whole, half = (volume.mesh(1, support).areas.sum() for support in (0.4, 1.0))
-    assert whole == pytest.approx(2 * half, rel=0.1)
-    assert len(volume.mesh(1, 2.5)) == 0
+@pytest.mark.parametrize(
+    ("views", "whole", "half", "none"),
+    [
+        ([(20.0, 1.0), (20.0 * RIGHT, 1.0)], (1, 0.0), (2, 0.0), (3, 0.0)),
+        ([(20.0, torch.where(RIGHT, 1.0, 0.5).expand(90, 120))] * 2, (1, 0.4), (1, 1.0), (1, 2.5)),
+        # Distances of 0 and 0.75 truncations have a variance of 0.14, of 0.07 over the support of two views.
+        ([(20.0, 1.0), (torch.where(RIGHT, 20.0, 20.75), 1.0)], (1, 0.0, 0.08), (1, 0.0, 0.06), (3, 0.0, 0.08)),
+    ],
+    ids=["few views", "little support", "views that disagree"],
+)
+def test_places_on_which_too_few_views_agree_are_left_out(views, whole, half, none):
+    camera = turned(0.0)
+    volume = Volume([view_of(camera, torch.ones(90, 120) * depth, quality) for depth, quality in views], 0.5, 2.0)
+    assert volume.mesh(*whole).areas.sum() == pytest.approx(2 * volume.mesh(*half).areas.sum(), rel=0.1)
+    assert len(volume.mesh(*none)) == 0
+
+
+def test_without_depth_there_is_no_surface():
+    assert len(Volume([view_of(turned(0.0), torch.zeros(90, 120))], 0.5, 4.0).mesh(1, 0.0)) == 0
 
 
 def test_of_two_views_the_better_counts_more():
@@ -90,15 +96,6 @@ def test_views_clear_the_space_before_what_they_see():
     real = [view_of(camera, torch.full((90, 120), 20.0))] * 2
     z = camera.project(torch.from_numpy(Volume([claimed, *real], 0.5, 3.0).mesh(1, 0.0).vertices).double())[1]
     assert z.min() > 19.9
-
-
-def test_places_on_which_views_disagree_are_left_out():
-    """Distances of 0 and 0.75 truncations have a variance of 0.14, of 0.07 over the support of two views."""
-    camera = turned(0.0)
-    other = torch.where(torch.arange(120) >= 60, 20.0, 20.75).expand(90, 120)
-    volume = Volume([view_of(camera, torch.full((90, 120), 20.0)), view_of(camera, other)], 0.5, 2.0)
-    half, whole = (volume.mesh(1, 0.0, conflict).areas.sum() for conflict in (0.06, 0.08))
-    assert whole == pytest.approx(2 * half, rel=0.1)
 
 
 def test_voxels_too_small_for_the_memory_are_refused(monkeypatch):
