@@ -305,24 +305,16 @@ class Level(IntEnum):
     GLANCE = 2
     SEEN = 3
 
-    @property
-    def label(self) -> str:
-        """For legends and tables."""
-        return _LABELS[self]
 
-    @property
-    def color(self) -> tuple[int, int, int]:
-        """RGB of maps and meshes; told apart with any colour vision."""
-        return _COLORS[self]
-
-
-_LABELS = ("not seen", "seen too dark or too far", "seen only at a glance", "seen")
-_COLORS = ((213, 62, 0), (95, 75, 139), (240, 200, 66), (150, 200, 190))
-#: Not seen and not reconstructed either: a guess of where the surface is.
-GUESS_LABEL = "not seen, place guessed"
-GUESS_COLOR = (122, 20, 20)
-#: Labels and colours (RGB) of maps, what was seen first.
-MAP_LEGEND = [*((level.label, level.color) for level in reversed(Level)), (GUESS_LABEL, GUESS_COLOR)]
+#: Labels and colours (RGB; told apart with any colour vision) of maps and meshes: by level, what was seen first, and of
+#: what was neither seen nor reconstructed, where the place of the surface is a guess.
+MAP_LEGEND = (
+    ("seen", (150, 200, 190)),
+    ("seen only at a glance", (240, 200, 66)),
+    ("seen too dark or too far", (95, 75, 139)),
+    ("not seen", (213, 62, 0)),
+    ("not seen, place guessed", (122, 20, 20)),
+)
 
 
 def classify(views: FaceViews, settings: CoverageSettings) -> UInt8[np.ndarray, "F"]:

@@ -12,7 +12,7 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.files import atomic_folder, atomic_write, refuse_existing, write_json
@@ -46,8 +46,7 @@ from coliags_plugin.surface.coverage.measure import (
     measure_coverage,
 )
 from coliags_plugin.surface.coverage.visibility import (
-    GUESS_COLOR,
-    GUESS_LABEL,
+    MAP_LEGEND,
     CoverageSettings,
     CoverageView,
     Level,
@@ -133,24 +132,26 @@ def draw_partial(coverage: PartialCoverage, views: Sequence[CoverageView]) -> UI
 
 def face_colors(coverage: SeenWall) -> UInt8[np.ndarray, "F 3"]:
     """Colour of each triangle by its level. [F, 3]"""
-    table = np.array([level.color for level in Level], np.uint8)
-    colors = table[coverage.level]
-    colors[coverage.guessed] = GUESS_COLOR
-    return np.asarray(colors)
+    return np.array([color for _, color in MAP_LEGEND], np.uint8)[_legend_index(coverage)]
 
 
-def legend_entries(coverage: SeenWall) -> list[tuple[str, tuple[int, int, int], Bool[np.ndarray, "F"]]]:
-    """Label, colour and triangles of each entry of a legend."""
-    entries = [(level.label, level.color, (coverage.level == level) & ~coverage.guessed) for level in reversed(Level)]
-    return [*entries, *([(GUESS_LABEL, GUESS_COLOR, coverage.guessed)] if coverage.guessed.any() else [])]
+def _legend_index(coverage: SeenWall) -> Int[np.ndarray, "F"]:
+    """Entry of each triangle in the legend. [F]"""
+    return np.where(coverage.guessed, len(Level), Level.SEEN - coverage.level.astype(int))
+
+
+def legend_areas(coverage: SeenWall) -> dict[str, float]:
+    """Area of each entry of the legend by its label; guessed wall only where there is some."""
+    index, shown = _legend_index(coverage), len(Level) + bool(coverage.guessed.any())
+    return {label: coverage.area(index == number) for number, (label, _) in enumerate(MAP_LEGEND[:shown])}
 
 
 def _legend(image: np.ndarray, coverage: SeenWall) -> None:
     total = coverage.area()
     x, y = _LEFT, 28
-    for label, color, chosen in legend_entries(coverage):
-        area = coverage.area(chosen)
-        if not area:
+    areas = legend_areas(coverage)
+    for label, color in MAP_LEGEND:
+        if not (area := areas.get(label)):
             continue
         text = f"{label} {100.0 * area / total:.1f} %"
         width = text_width(text)
@@ -234,10 +235,9 @@ def coverage_facts(coverage: WallCoverage | PartialCoverage) -> list[Fact]:
 
 def level_table(coverage: SeenWall) -> Table:
     """Area and share of each level."""
-    areas = {label: coverage.area(chosen) for label, _, chosen in legend_entries(coverage)}
     rows = [
         [label, area_text(area, coverage.metric), f"{100.0 * area / coverage.area():.1f}"]
-        for label, area in areas.items()
+        for label, area in legend_areas(coverage).items()
     ]
     return simple_table(["wall", "area", "share, %"], rows)
 
@@ -300,7 +300,7 @@ def region_picture(
     corners = corners.reshape(-1, 3)
     painted = image.copy()
     for triangle in np.rint(pixels[corners[drawable[corners].all(axis=1)]]).astype(np.int32):
-        cv2.fillConvexPoly(painted, triangle, Level.UNSEEN.color)
+        cv2.fillConvexPoly(painted, triangle, MAP_LEGEND[Level.SEEN - Level.UNSEEN][1])
     return np.asarray(cv2.addWeighted(painted, _OPACITY, image, 1.0 - _OPACITY, 0.0))
 
 

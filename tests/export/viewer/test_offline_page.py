@@ -29,7 +29,7 @@ from coliags_plugin.export.viewer.page import Layer, packed_path, page_html, sce
 from coliags_plugin.fields.spherical_harmonics import Y0
 from coliags_plugin.geometry.meshes.mesh import TriangleMesh, write_mesh
 from coliags_plugin.renderers.torch_renderer import TorchRenderer, TorchRendererSettings
-from coliags_plugin.surface.coverage.visibility import Level
+from coliags_plugin.surface.coverage.visibility import MAP_LEGEND
 from tests.commands import refused, run
 from tests.export.splats.clouds import random_cloud
 
@@ -284,7 +284,7 @@ def test_a_report_embeds_a_scene(anchors, tmp_path):
 
 def test_meshes_of_the_run_are_layers_and_maps_of_coverage_have_a_legend_of_their_colours(run_of):
     run = run_of("2dgs")
-    colors = np.array([Level.SEEN.color, Level.SEEN.color, Level.UNSEEN.color], np.uint8)
+    colors = np.array([MAP_LEGEND[index][1] for index in (0, 0, 3)], np.uint8)
     for file in ("mesh/mesh.ply", "coverage/coverage.ply"):
         write_mesh(run.path / file, TriangleMesh(np.eye(3, dtype=np.float32), np.array([[0, 1, 2]]), colors))
     page = scene_page(run.load())

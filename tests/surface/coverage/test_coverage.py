@@ -34,6 +34,7 @@ from coliags_plugin.surface.coverage.measure import (
     neighbours,
 )
 from coliags_plugin.surface.coverage.visibility import (
+    MAP_LEGEND,
     CoverageSettings,
     Level,
     RayGrid,
@@ -299,7 +300,7 @@ def test_of_a_wall_without_a_lumen_the_seen_area_remains():
     assert coverage.area(coverage.level == Level.GLANCE) == pytest.approx(48.0 * 36.0, rel=0.02)
     assert coverage.area() == pytest.approx(60.0**2)
     picture = draw_partial(coverage, [view_at((0, 0, 0))] * 2)
-    assert (picture == Level.UNSEEN.color).all(axis=-1).any()
+    assert (picture == dict(MAP_LEGEND)["not seen"]).all(axis=-1).any()
 
 
 def test_a_tube_of_unknown_unit_is_seen_at_any_distance():
