@@ -240,7 +240,7 @@ def _states(cells: Sequence[ComparisonCell], comparison: ComparisonFolder) -> Di
     rows: list[dict[str, Value]] = []
     keys: set[str] = set()
     for cell in cells:
-        step, changed = 0, ""
+        step = 0
         if cell.fingerprint is None:
             state = "scene to make"
         elif comparison.done(cell) is not None:
@@ -249,15 +249,13 @@ def _states(cells: Sequence[ComparisonCell], comparison: ComparisonFolder) -> Di
             state = "same"
         else:
             keys.add(cell.planned.key)
-            step, changed = comparison.run(cell).step, comparison.changes(cell)
+            step = comparison.run(cell).step
             state = "resume" if step else "new"
         steps = f"{step} of {cell.steps}" if step else str(cell.steps)
-        rows.append({"cell": cell.title, "state": state, "steps": steps, "changed": changed or None})
-    columns = [Column("cell"), Column("state", words=True), Column("steps")]
-    if any(row["changed"] for row in rows):
-        columns.append(Column("changed", "done before, but changed", words=True))
+        rows.append({"cell": cell.title, "state": state, "steps": steps})
     counts = Counter(row["state"] for row in rows)
     states = ", ".join(f"{count} {state}" for state, count in counts.items())
+    columns = [Column("cell"), Column("state", words=True), Column("steps")]
     return DisplayTable(f"{len(cells)} cells: {states}", columns, rows)
 
 

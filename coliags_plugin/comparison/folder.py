@@ -24,7 +24,6 @@ from coliags_plugin.core.files import write_json
 from coliags_plugin.core.jobs import locked
 from coliags_plugin.core.text_files import without_places
 from coliags_plugin.engine.run_folder import RunFolder
-from coliags_plugin.results.hashing import code_key, training_config
 from coliags_plugin.results.reading import NewerResultError, read_result, write_result
 from coliags_plugin.results.record import Result
 
@@ -88,15 +87,15 @@ class ComparisonFolder:
             )
         if before is None:
             return
-        lengths = [f"`steps={each.steps}`" if each.steps else "each method's own steps" for each in (before, options)]
-        sets = (before.overrides, options.settings)
-        changes = [" ".join(f"`{change}`" for change in each) or "no settings" for each in sets]
-        values = [list(parse_assignments(each).items()) for each in sets]  # 1e-3 is 0.001
-        for (earlier, later), is_same in ((lengths, before.steps == options.steps), (changes, values[0] == values[1])):
-            if not is_same:
-                raise InputError(
-                    f"{self.path} compares runs with {earlier}, not {later}", "the same, or another `output`"
-                )
+        former, latter = (
+            [("steps", each.steps or "each method's own"), *parse_assignments(changes).items()]  # 1e-3 is 0.001
+            for each, changes in ((before, before.overrides), (options, options.settings))
+        )
+        if former != latter:
+            texts = (", ".join(f"`{key}={value}`" for key, value in each) for each in (former, latter))
+            raise InputError(
+                "{} compares runs with {}, not {}".format(self.path, *texts), "the same, or another `output`"
+            )
 
     def record(self, options: CompareOptions, cells: Sequence[ComparisonCell]) -> None:
         """Add to the plan what is asked for now; a cell whose key has changed replaces the former one.
@@ -145,20 +144,6 @@ class ComparisonFolder:
         if own is not None and own.key == key:
             return own
         return next((result for result in self._results.values() if result.key == key), None)
-
-    def changes(self, cell: ComparisonCell) -> str:
-        """Reasons why a cell's earlier result is out of date, for instance ``code, data``; empty without one."""
-        place, _, _ = str(self.path / cell.planned.result).rpartition("-")  # without the key
-        former = [each for path, each in self._results.items() if str(path).rpartition("-")[0] == place]
-        former = [each for each in former if each.protocol.name == cell.protocol]
-        if not former:
-            return ""
-        changed = {
-            "code": all(each.software.get("code") != code_key() for each in former),
-            "method": all(training_config(each.config) != training_config(cell.config.model_dump()) for each in former),
-            "data": all(each.scene.fingerprint != cell.fingerprint for each in former),
-        }
-        return ", ".join(name for name, differs in changed.items() if differs) or "protocol, or how it was run"
 
     def add(self, cell: ComparisonCell, result: Result) -> None:
         """Count a cell as done, and write its results file where that is not there.

@@ -10,12 +10,8 @@ import shutil
 
 import pytest
 
-from coliags_plugin.comparison import folder as comparison_folder
-from coliags_plugin.comparison import plan
-from coliags_plugin.comparison.compare import dry_run
 from coliags_plugin.comparison.folder import ComparisonFolder
 from coliags_plugin.comparison.named_files import Variant
-from coliags_plugin.config.options import CompareOptions
 from coliags_plugin.core.errors import InputError, InterruptedRunError
 from coliags_plugin.engine.evaluator import evaluate
 from coliags_plugin.engine.tasks import TaskOutcome
@@ -68,20 +64,6 @@ def test_a_comparison_leaves_runs_results_and_a_plan(compared):
         assert len(list((compared / cell["run"] / "checkpoints").iterdir())) == 1
     assert not (compared / "failures").exists()
     assert str(compared) not in (compared / "plan.json").read_text()
-
-
-def test_a_dry_run_says_what_has_changed_since_a_cell_was_done(wall, folder, monkeypatch):
-    def states(overrides=TINY, scene=wall):
-        monkeypatch.setattr(ComparisonFolder, "check_extends", lambda *_: None)
-        planned = dry_run("coliags", CompareOptions((scene,), folder, steps=3, settings=tuple(overrides)))
-        return [(row["state"], row["changed"]) for row in planned.rows]
-
-    assert states() == [("done", None)]
-    assert states((*TINY, "field.features=4")) == [("new", "method")]
-    assert states(scene=write_wall(folder.parent / "wall", frames=10)) == [("new", "data")]
-    for module in (plan, comparison_folder):
-        monkeypatch.setattr(module, "code_key", lambda: "0123456789abcdef")
-    assert states() == [("new", "code")]
 
 
 @pytest.mark.parametrize(("lost", "count"), [(("runs", "plan.json"), 0), (("results",), 2)])
@@ -283,8 +265,12 @@ def test_a_damaged_result_is_written_again_and_a_newer_one_refused(wall, folder,
         ('{"format": "coliags-comparison", "version": 99}', {}, "plan.json is from a newer version"),
         ("{", {}, "plan.json is not JSON"),
         ('{"cells": 3}', {}, "plan.json: cells"),
-        (None, {"steps": None}, "compares runs with `steps=3`, not each method's own steps"),
-        (None, {"overrides": ["field.features=4"]}, "compares runs with .*`field.features=8` .*, not `field.f"),
+        (None, {"steps": None}, "compares runs with `steps=3`, .*, not `steps=each method's own`, "),
+        (
+            None,
+            {"overrides": ["field.features=4"]},
+            "compares runs with .*`field.features=8`, .*, not .*=4`",
+        ),
     ],
 )
 def test_plans_that_cannot_be_read_and_runs_of_another_kind(wall, folder, content, options, message):

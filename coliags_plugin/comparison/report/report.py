@@ -49,8 +49,6 @@ from coliags_plugin.results.reading import csv_text, frame_rows
 _TIMES = "\N{MULTIPLICATION SIGN}"
 #: Scenes listed by name; of more, only their number is given.
 _LISTED = 12
-#: Hexadecimal digits of a hash that are shown.
-_DIGITS = 12
 
 #: Formats with their suffixes.
 SUFFIXES = {"html": ".html", "markdown": ".md", "latex": ".tex", "csv": ".csv", "json": ".json"}
@@ -213,21 +211,14 @@ def _provenance(study: Study) -> Section:
         provenance = {name: value for name, value in result.provenance.items() if name != "scene"}
         blocks.append(record(method, {**values, **provenance, "config": result.config}))
     rows = [_run_row(run, study.methods.index(run.method)) for run in study.runs]
-    note = (
-        f"Key: of all that determines the result. Values, predictions, truth: the first {_DIGITS} digits of their "
-        "SHA-256, the latter two of each test set"
-    )
     columns = [Column(name, words=name not in ("Seed", "Steps")) for name in rows[0]]
-    blocks.append(Folded(counted(len(study.runs), "run"), [Table("Runs", columns, rows, [note], name="runs")]))
+    table = Table("Runs", columns, rows, ["Key: hash of all that determines the result"], name="runs")
+    blocks.append(Folded(counted(len(study.runs), "run"), [table]))
     return Section("Provenance", blocks, screen_only=True)
 
 
 def _run_row(run: StudyRun, style: int) -> dict[str, TableCell | str | float]:
     result = run.result
-    hashes = {
-        name: " ".join(dict.fromkeys(getattr(part, f"{name}_sha256")[:_DIGITS] for part in result.sets.values()))
-        for name in ("predictions", "truth")
-    }
     return {
         "Method": TableCell(run.method, style=style),
         "Scene": run.scene,
@@ -239,7 +230,4 @@ def _run_row(run: StudyRun, style: int) -> dict[str, TableCell | str | float]:
         "Version": str(result.software.get("package_version") or ""),
         "Code": run.code,
         "Key": result.key,
-        "Values": result.metrics_sha256[:_DIGITS],
-        "Predictions": hashes["predictions"],
-        "Truth": hashes["truth"],
     }

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from coliags_plugin.comparison.plan import PLAN_FILE, RESULTS, ComparisonPlan, read_plan
+from coliags_plugin.comparison.plan import ComparisonPlan, read_plan
 from coliags_plugin.comparison.report.study import MissingResult, Study, StudyRun, grouped
 from coliags_plugin.core.errors import InputError, check_name
 from coliags_plugin.core.json_files import read_json
@@ -15,9 +15,6 @@ from coliags_plugin.reporting.model import leaves
 from coliags_plugin.results.hashing import training_key
 from coliags_plugin.results.reading import RESULT_FILE, read_result
 from coliags_plugin.results.record import TRUTH_SUFFIX
-
-#: Below results and failures: scene, method, and seed with key.
-_CELL = "*/*/s*-*.json"
 
 
 def read_study(paths: Sequence[Path], protocol: str = "paper", methods: Sequence[str] = ()) -> Study:
@@ -34,9 +31,8 @@ def read_study(paths: Sequence[Path], protocol: str = "paper", methods: Sequence
     for path in paths:
         if not path.is_dir():
             runs.append(_read_file(path, path.stem))
-        elif (path / PLAN_FILE).is_file() or (path / RESULTS).is_dir() or any(path.glob(_CELL)):
-            plan = read_plan(path)
-            plans += [plan] if plan else []
+        elif (plan := read_plan(path)) is not None:
+            plans.append(plan)
             runs += _read_comparison(path, plan, protocol, missing)
         else:
             runs.append(_read_run(path, protocol))
@@ -87,21 +83,19 @@ def _read_file(file: Path, stamp: str, run: Path | None = None) -> StudyRun:
     return StudyRun(result.method, result, file, stamp, run)
 
 
-def _read_comparison(
-    folder: Path, plan: ComparisonPlan | None, protocol: str, missing: list[MissingResult]
-) -> list[StudyRun]:
-    """Results of one protocol, in the plan's order, or all without a plan; appends the cells without one."""
-    if plan is None:
-        files = sorted([*folder.glob(_CELL), *(folder / RESULTS).glob(_CELL)])
-        runs = [_read_file(file, file.stem) for file in files]
-        protocols = {run.result.protocol.name for run in runs}
-        runs = [run for run in runs if run.result.protocol.name == protocol]
-    else:
-        runs, protocols = [], {cell.protocol for cell in plan.cells}
+def _read_comparison(folder: Path, plan: ComparisonPlan, protocol: str, missing: list[MissingResult]) -> list[StudyRun]:
+    """Results of one protocol, in the plan's order; appends the cells without one."""
+    cells = [cell for cell in plan.cells if cell.protocol == protocol]
+    protocols = {cell.protocol for cell in plan.cells}
+    if protocols and not cells:
+        raise InputError(
+            f"{folder} has results of protocol {', '.join(sorted(protocols))} only",
+            f"some of '{protocol}'",
+            f"Pass `protocol={min(protocols)}`",
+        )
+    runs: list[StudyRun] = []
     folders: dict[str, Path] = {}  # by key: a method that is the same as another one has no run of its own
-    for cell in plan.cells if plan else ():
-        if cell.protocol != protocol:
-            continue
+    for cell in cells:
         file, failure = folder / cell.result, folder / cell.failure_file
         if file.is_file():
             runs.append(replace(_read_file(file, file.stem), method=cell.method))
@@ -113,12 +107,6 @@ def _read_comparison(
                 record = read_json(failure, "the reason of a failure")
                 reason = str((isinstance(record, dict) and record.get("reason")) or "no reason was recorded")
             missing.append(MissingResult(cell.scene, cell.method, cell.seed, reason))
-    if protocols and protocol not in protocols:
-        raise InputError(
-            f"{folder} has results of protocol {', '.join(sorted(protocols))} only",
-            f"some of '{protocol}'",
-            f"Pass `protocol={min(protocols)}`",
-        )
     return [replace(run, run=folders.get(run.result.key)) for run in runs]
 
 

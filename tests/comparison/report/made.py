@@ -140,8 +140,7 @@ def write_comparison(folder, results, failures=()):
         file = folder / "failures" / f"{place_of(scene, method, seed, digest(scene, method))}.json"
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_text(json.dumps({"reason": reason}))
-    if failures:
-        write_plan(folder, results, *(failure[:3] for failure in failures))
+    write_plan(folder, results, *(failure[:3] for failure in failures))
     return folder
 
 
@@ -155,6 +154,7 @@ def write_plan(folder, results, *more, decided=None):
         for cell in cells
     ]  # fmt: skip
     content = {"format": "coliags-comparison", "decided": decided, "cells": entries}
+    folder.mkdir(parents=True, exist_ok=True)
     (folder / "plan.json").write_text(json.dumps(content))
 
 

@@ -40,7 +40,7 @@ def test_a_run_a_file_and_a_comparison_are_read_alike(tmp_path):
     run, file = write_run(tmp_path / "run", result), tmp_path / "result.json"
     write_result(file, result)
     folder = write_comparison(tmp_path / "comparison", [result])
-    for path in (run, file, folder, folder / "results"):
+    for path in (run, file, folder):
         study = read_study([path])
         assert [cell.result for cell in study.runs] == [result]
         assert study.missing == ()
@@ -120,7 +120,6 @@ def test_a_method_under_a_second_name_shows_the_run_of_the_first(tmp_path):
     first, other = result_of("coliags"), result_of("3dgs")
     second = first.model_copy(update={"method": "depth-imve-imia"})
     folder = write_comparison(tmp_path, [second, first, other])
-    write_plan(folder, [second, first, other])
     run = write_run(folder / f"runs/cecum/coliags/s0-{first.key[:8]}", first)
     assert [cell.run for cell in read_study([folder]).runs] == [run, run, None]
 
@@ -129,8 +128,7 @@ def test_nothing_what_was_not_evaluated_and_what_is_there_twice_are_refused(tmp_
     refuses([], "no results")
     refuses([tmp_path / "none"], "none.json|none")
     refuses([tmp_path], "holds no results")
-    (tmp_path / "results").mkdir()
-    refuses([tmp_path], "holds no results. Expected at least one finished cell")
+    refuses([write_comparison(tmp_path / "new", [])], "holds no results. Expected at least one finished cell")
     failed = write_comparison(tmp_path / "f", [], [("cecum", "3dgs", 0, "no <memory>")])
     refuses([failed], "holds no results of 1 cells; 3dgs on cecum: no <memory>")
     run = write_run(tmp_path / "run", result_of("coliags"))
