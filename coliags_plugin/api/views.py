@@ -68,8 +68,8 @@ class RenderedView:
             shown[f"true depth, {scale}"] = colorize_depth(self.true_depth, limits)
         shown[f"depth, {scale}"] = colorize_depth(self.depth, limits)
         if self.true_depth is not None:
-            errors, limit = depth_error(self.depth, self.true_depth), self.error_limit
-            shown[f"depth error, 0 to {limit:g} {self.unit}"] = colorize_error(*errors, limit)
+            error, limit = depth_error(self.depth, self.true_depth), self.error_limit
+            shown[f"depth error, 0 to {limit:g} {self.unit}"] = colorize_error(error, limit)
         return shown
 
     def _repr_html_(self) -> str:

@@ -110,8 +110,8 @@ def _write_images(folder: Path, set_name: str, frame: Frame, comparison: Compari
     true_depth = torch.where(comparison.depth_valid, comparison.true_depth, torch.nan)
     write_depth_tiff(folder / "depth" / f"{name}.tiff", comparison.depth)
     write_depth_tiff(folder / "true_depth" / f"{name}.tiff", true_depth)
-    errors = depth_error(comparison.depth, true_depth, comparison.depth_valid)
-    write_png(folder / "errors" / f"{name}.png", colorize_error(*errors, error_limit))
+    error = depth_error(comparison.depth, true_depth, comparison.depth_valid)
+    write_png(folder / "errors" / f"{name}.png", colorize_error(error, error_limit))
 
 
 def _write_depth_pictures(evaluation: Path, unit: str) -> None:

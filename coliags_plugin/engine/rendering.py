@@ -134,11 +134,11 @@ def _write_frame(
     write_png(folder / "depth" / name, depth_picture(output, depth_name, limits))
     valid = frame.valid.cpu()
     if not trained.relit:
-        errors = rgb_error(output.rgb.cpu(), frame.image, valid)
-        write_png(folder / "rgb_error" / name, colorize_error(*errors, RGB_ERROR_LIMIT))
+        error = rgb_error(output.rgb.cpu(), frame.image, valid)
+        write_png(folder / "rgb_error" / name, colorize_error(error, RGB_ERROR_LIMIT))
     if (true := frame.true_depth) is not None:
-        errors = depth_error(depth.cpu(), true, valid)
-        write_png(folder / "depth_error" / name, colorize_error(*errors, error_limit_of(trained)))
+        error = depth_error(depth.cpu(), true, valid)
+        write_png(folder / "depth_error" / name, colorize_error(error, error_limit_of(trained)))
 
 
 def depth_picture(output: RenderOutput, depth: str, limits: tuple[float, float]) -> UInt8[np.ndarray, "H W 3"]:

@@ -95,41 +95,40 @@ def depth_error(
     rendered_mm: Float[np.ndarray, "H W"] | Tensor,
     true_mm: Float[np.ndarray, "H W"] | Tensor,
     valid: Bool[np.ndarray, "H W"] | Tensor | None = None,
-) -> tuple[Float[np.ndarray, "H W"], Bool[np.ndarray, "H W"]]:
-    """Absolute depth error, mm, and where the truth is known.
+) -> Float[np.ndarray, "H W"]:
+    """Absolute depth error, mm, NaN where the truth is unknown or a pixel does not count. [H, W]
 
     Depths are of one kind, mm; NaN of the truth is unknown. ``valid`` masks the pixels that count. The error is
-    infinite where only the rendering is not finite, and 0 where the truth is unknown.
+    infinite where only the rendering is not finite.
     """
     rendered, true = (as_array(depth).astype(np.float64) for depth in (rendered_mm, true_mm))
     counts = np.isfinite(true)
     if valid is not None:
         counts = counts & as_array(valid).astype(bool)
-    error = np.zeros_like(true)
+    error = np.full_like(true, np.nan)
     error[counts] = np.abs(rendered[counts] - true[counts])
     error[counts & ~np.isfinite(rendered)] = np.inf
-    return error, counts
+    return error
 
 
 def rgb_error(
     rendered: np.ndarray | Tensor,
     true: np.ndarray | Tensor,
     valid: Bool[np.ndarray, "H W"] | Tensor | None = None,
-) -> tuple[Float[np.ndarray, "H W"], Bool[np.ndarray, "H W"]]:
-    """Mean over the channels of |rendered - true|, as a fraction of full scale, and which pixels count.
+) -> Float[np.ndarray, "H W"]:
+    """Mean over the channels of |rendered - true|, a fraction of full scale, NaN where a pixel does not count. [H, W]
 
     Colours are uint8, or floating point in [0, 1]. ``valid`` masks the pixels that count.
     """
     error: np.ndarray = np.abs(_unit_rgb(rendered) - _unit_rgb(true)).mean(axis=2)
-    return error, np.ones(error.shape, dtype=bool) if valid is None else as_array(valid).astype(bool)
+    return error if valid is None else np.where(as_array(valid).astype(bool), error, np.nan)
 
 
-def colorize_error(
-    error: Float[np.ndarray, "H W"], valid: Bool[np.ndarray, "H W"], limit: float
-) -> UInt8[np.ndarray, "H W 3"]:
-    """Colour-mapped error of 0 to ``limit`` and more; pixels without ground truth are hatched in grey."""
-    image = colored(np.where(valid, error, 0.0) / limit, "error")
-    image[~valid] = hatch(*valid.shape)[~valid]
+def colorize_error(error: Float[np.ndarray, "H W"], limit: float) -> UInt8[np.ndarray, "H W 3"]:
+    """Colour-mapped error of 0 to ``limit`` and more; where it is NaN, without ground truth, hatched in grey."""
+    unknown = np.isnan(error)
+    image = colored(np.where(unknown, 0.0, error) / limit, "error")
+    image[unknown] = hatch(*error.shape)[unknown]
     return image
 
 

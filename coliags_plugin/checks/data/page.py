@@ -143,7 +143,7 @@ def _pair_images(source: Frame, target: Frame, unit: str) -> model.Figures:
             (eight_bit(canvas), f"{target.name} warped from {source.name}"),
             (eight_bit(mixed), "checkerboard of both: edges must be continuous"),
             (
-                colorize_error(*rgb_error(painted.float(), target.rgb, shown), RGB_ERROR_LIMIT),
+                colorize_error(rgb_error(painted.float(), target.rgb, shown), RGB_ERROR_LIMIT),
                 "difference, black 0 to yellow 20 % of full scale",
             ),
         ]

@@ -102,7 +102,7 @@ class _View:
     truth: Rgb
     true_depth: Map | None  # mm, NaN where unknown; None where the frame has none
     renderings: Sequence[_Rendering]  # of one run of every method
-    of_depth: bool  # whether the errors are of depth
+    kind: str  # of the errors: depth or colour
 
     @property
     def in_row(self) -> bool:
@@ -121,12 +121,12 @@ def _read_view(frame: _Frame, runs: Sequence[StudyRun]) -> _View:
     true_depth = next((depth for depth in depths("true_depth") if depth is not None), None)
     errors: list[Map | None] = [None]
     if true_depth is not None:
-        errors = [None if depth is None else _depth_error(depth, true_depth) for depth in depths("depth")]
-    of_depth = any(error is not None for error in errors)
-    if not of_depth:
-        errors = [(rgb_error(render, truth)[0] * 255.0).astype(np.float32) for render in renders]
+        errors = [None if depth is None else depth_error(depth, true_depth).astype("f4") for depth in depths("depth")]
+    kind = "colour" if all(error is None for error in errors) else "depth"
+    if kind == "colour":
+        errors = [255.0 * rgb_error(render, truth).astype("f4") for render in renders]
     renderings = map(_Rendering, runs, renders, errors, depths("expected_depth"))
-    return _View(frame, truth, true_depth, [*renderings], of_depth)
+    return _View(frame, truth, true_depth, [*renderings], kind)
 
 
 def _read(run: StudyRun, kind: str, frame: _Frame) -> Any:
@@ -152,11 +152,6 @@ def _read(run: StudyRun, kind: str, frame: _Frame) -> Any:
     return cv2.resize(pixels, (width // factor, height // factor), interpolation=interpolation)
 
 
-def _depth_error(depth: Map, truth: Map) -> Map:
-    error, is_known = depth_error(depth, truth)
-    return np.where(is_known, error, np.nan).astype(np.float32)
-
-
 def _reduction(width: int) -> int:
     """Integer factor by which images of a width are reduced."""
     return math.ceil(width / _WIDEST)
@@ -179,10 +174,10 @@ def view_section(study: Study, reference: str, count: int) -> Section:
     error_ends, depth_limits = _scales(views)
     unit = study.length_unit
     bars = [
-        ColorBar((0.0, end), unit, "error", "|depth error|", "error-scale")
-        if of_depth
-        else ColorBar((0.0, end), "levels of 255", "error", "|colour error|", "colour-error-scale")
-        for of_depth, end in error_ends.items()
+        ColorBar(
+            (0.0, end), unit if kind == "depth" else "levels of 255", "error", f"|{kind} error|", f"{kind}-error-scale"
+        )
+        for kind, end in error_ends.items()
     ]
     if depth_limits is not None:
         bars.append(ColorBar(depth_limits, unit, "depth", "depth", "depth-scale"))
@@ -214,24 +209,22 @@ def view_section(study: Study, reference: str, count: int) -> Section:
     return Section(title, blocks, screen_only=True, name="views")
 
 
-def _scales(views: Sequence[_View]) -> tuple[dict[bool, float], tuple[float, float] | None]:
-    """Ends of the scales of depth errors (True) and colour errors, and limits of depth, each where there is any.
+def _scales(views: Sequence[_View]) -> tuple[dict[str, float], tuple[float, float] | None]:
+    """Ends of the scales of errors by their kinds, and limits of depth, each where there is any.
 
     The limits are those of the true depths, or of the expected ones where there is no true depth.
     """
-    renderings = [(view.of_depth, each) for view in views for each in view.renderings]
     ends = {
-        kind: error_limit([each.error for of_depth, each in renderings if of_depth is kind and each.error is not None])
-        for kind in (True, False)
-        if any(of_depth is kind for of_depth, _ in renderings)
+        kind: error_limit([each.error for view in same for each in view.renderings if each.error is not None])
+        for kind, same in grouped(views, lambda view: view.kind).items()
     }
     depths = [view.true_depth for view in views if view.true_depth is not None]
-    depths = depths or [each.expected for _, each in renderings if each.expected is not None]
+    depths = depths or [each.expected for view in views for each in view.renderings if each.expected is not None]
     return ends, common_limits(depths) if depths else None
 
 
 def _template_values(
-    view: _View, error_ends: Mapping[bool, float], depth_limits: tuple[float, float] | None
+    view: _View, error_ends: Mapping[str, float], depth_limits: tuple[float, float] | None
 ) -> dict[str, Any]:
     """Values of a view for the template."""
     frame, where = view.frame, f"frame {view.frame.name}"
@@ -245,15 +238,14 @@ def _template_values(
     elif not view.in_row:
         tiles.append((None, "no true depth"))
     cells: list[tuple[str, int | None, list[_Tile], list[str]]] = [("truth", None, tiles, caption)]
-    kind = "depth" if view.of_depth else "colour"
     for rendering in view.renderings:
         name = rendering.run.method
         tiles = [(EncodedImage.jpeg(rendering.rgb), f"{where}, rendered by {name}")]
         if rendering.error is None:
             tiles.append((None, "no depth to compare"))
         else:
-            drawn = colorize_error(rendering.error, ~np.isnan(rendering.error), error_ends[view.of_depth])
-            tiles.append((EncodedImage.webp(drawn), f"{where}, absolute {kind} error of {name}"))
+            drawn = colorize_error(rendering.error, error_ends[view.kind])
+            tiles.append((EncodedImage.webp(drawn), f"{where}, absolute {view.kind} error of {name}"))
             if rendering.expected is not None and depth_limits is not None:
                 drawn = colorize_depth(rendering.expected, depth_limits, hatched=True)
                 tiles.append((EncodedImage.webp(drawn), f"{where}, expected depth of {name}"))

@@ -107,7 +107,7 @@ def test_one_file_that_needs_nothing_else(tmp_path, two_runs):
     html = (tmp_path / "out" / "report.html").read_text()
     assert html == (tmp_path / "again.html").read_text(), "the same runs give the same bytes"
     assert "@import" not in html and "import(" not in html and "fetch(" not in html
-    assert re.findall(r"url\((.*?)\)", html) == ["#error-scale", "#depth-scale"]
+    assert re.findall(r"url\((.*?)\)", html) == ["#depth-error-scale", "#depth-scale"]
     assert "prefers-color-scheme: dark" in html
     style = html.split("<style>")[1].split("</style>")[0]
     used = {word for _, attributes in page.tags for word in (attributes.get("class") or "").split()}
