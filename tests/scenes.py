@@ -86,3 +86,5 @@ def write_frames(folder: Path, frames: Sequence[Frame], depth: bool = True, poin
 
 #: Overrides that make a shipped method small enough for a test.
 SMALL = ("datamanager.points_count=2000", "field.voxel_size=2.0", "schedule.log_every=1")
+#: The same as words of a command.
+SETS = [word for override in SMALL for word in ("--set", override)]

@@ -24,7 +24,7 @@ from coliags_plugin.reporting.image_files import read_depth_tiff
 from tests.commands import run
 from tests.comparison.small import TINY, InlineExecutor
 from tests.faults import content
-from tests.scenes import SMALL, wall_scene, write_frames, write_wall
+from tests.scenes import SETS, SMALL, wall_scene, write_frames, write_wall
 
 ROOT = Path(__file__).parents[1]
 SETTINGS = parse_assignments(SMALL)
@@ -46,8 +46,7 @@ def result(trained):
 
 
 def test_train_is_the_command(scene, trained, tmp_path):
-    sets = [part for override in SMALL for part in ("--set", override)]
-    assert run("train", "coliags", "--data", scene, "--output", tmp_path / "run", "--steps", 8, "--seed", 3, *sets) == 0
+    assert run("train", "coliags", "--data", scene, "--output", tmp_path / "run", "--steps", 8, "--seed", 3, *SETS) == 0
     states = [handle.load().model.state_dict() for handle in (trained, cp.load_run(tmp_path / "run"))]
     assert states[0].keys() == states[1].keys()
     assert all(torch.equal(states[0][name], states[1][name]) for name in states[0])

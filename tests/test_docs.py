@@ -29,7 +29,7 @@ from coliags_plugin.engine.samplers import PURPOSES
 from coliags_plugin.phantom.settings import PRESETS
 from coliags_plugin.results.reading import find_results
 from tests.commands import run
-from tests.scenes import SMALL, write_wall
+from tests.scenes import SETS, write_wall
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -210,7 +210,7 @@ def test_the_tutorial_runs_as_written(tmp_path):
             continue
         assert words.pop(0) == "coliags"
         if words[0] == "train":
-            words += [part for override in SMALL for part in ("--set", override)]
+            words += SETS
         commands.append(words)
     argv = [sys.executable, "-c", ONE_AFTER_THE_OTHER, json.dumps(commands)]
     options = {"cwd": tmp_path, "env": environment, "capture_output": True, "text": True, "timeout": 120}

@@ -138,11 +138,10 @@ def parse_intrinsics(intrinsics: str | None, size: str | None) -> Intrinsics | N
     from coliags_plugin.core.intrinsics import Intrinsics
     from coliags_plugin.geometry.poses.formats import prefixed_errors
 
-    if intrinsics is None and size is None:
-        return None
     if intrinsics is None or size is None:
-        passed, lacking = ("--size", "--intrinsics") if intrinsics is None else ("--intrinsics", "--size")
-        raise InputError(f"{passed} without {lacking}", "both, or neither")
+        if intrinsics != size:
+            raise InputError("--intrinsics without --size, or the reverse", "both or neither")
+        return None
     try:
         fx, fy, cx, cy = (float(part) for part in intrinsics.split(","))
     except ValueError as error:

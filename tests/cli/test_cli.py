@@ -26,9 +26,7 @@ from coliags_plugin.reporting.colormaps import hatch
 from coliags_plugin.reporting.image_files import read_depth_tiff
 from tests.commands import refused, run
 from tests.export.splats.clouds import random_cloud
-from tests.scenes import SMALL, write_wall
-
-SETS = [part for override in SMALL for part in ("--set", override)]
+from tests.scenes import SETS, SMALL, write_wall
 
 
 @pytest.fixture(scope="module")
@@ -46,13 +44,10 @@ def trained(scene, tmp_path_factory):
     return path
 
 
-def test_train_leaves_everything(trained):
+def test_train_leaves_everything_and_eval_numbers_or_null_with_a_reason(trained):
     names = {path.name for path in trained.iterdir()}
     assert names == {"config.yaml", "provenance.json", "metrics.jsonl", "checkpoints", "eval"}
     assert [path.name for path in (trained / "checkpoints").iterdir()] == ["step-000060"]
-
-
-def test_eval_writes_numbers_or_null_with_a_reason(trained):
     summary = json.loads((trained / "eval/paper/metrics.json").read_text())
     assert summary["protocol"] == {**summary["protocol"], "name": "paper", "version": 1}
     assert summary["psnr"] > 15
@@ -273,9 +268,8 @@ def telling(folder, *secrets):
 
 
 def test_of_a_run_its_evaluation_and_a_report(tmp_path, janes):
-    small = [word for override in SMALL for word in ("--set", override)]
     out = tmp_path / "out"
-    options = ("--steps", 2, "--renderer", "torch", *small)
+    options = ("--steps", 2, "--renderer", "torch", *SETS)
     assert run("train", "scaffold-gs", "--data", janes, "--output", out / "run", *options) == 0
     assert json.loads((out / "run/provenance.json").read_text())["scene"]["path"] == "../../Jane Doe/scene"
     (tmp_path / "elsewhere").mkdir()

@@ -19,7 +19,7 @@ from coliags_plugin.geometry.poses.trajectory import Trajectory
 from coliags_plugin.reconstruction.structure.sfm_settings import SfmSettings
 from coliags_plugin.reporting.image_files import write_png
 from tests.commands import refused, run
-from tests.scenes import SMALL
+from tests.scenes import SETS
 from tests.textured_tube import INTRINSICS, tube_frames, write_tube
 
 PINHOLE = ("--intrinsics", "61,55,33.5,21.5", "--size", "64x48")
@@ -99,7 +99,7 @@ def test_images_give_names(truth, tmp_path, capsys):
         (("--to", "tum", "--from", "tum"), "line 1:"),
         (("--to", "endogslam"), "no intrinsics"),
         (("--to", "endogslam-truth"), "is read-only"),
-        (("--to", "colmap", "--size", "64x48"), "--size without --intrinsics"),
+        (("--to", "colmap", "--size", "64x48"), "--intrinsics without --size, or the reverse"),
         (("--to", "colmap", "--intrinsics", "1,2,3,4"), "--intrinsics without --size"),
         (("--to", "colmap", "--intrinsics", "1,2,3", "--size", "64x48"), "--intrinsics 1,2,3. Expected four numbers"),
         (("--to", "colmap", "--intrinsics", "0,2,3,4", "--size", "64x48"), "--intrinsics, --size: intrinsics fx 0"),
@@ -177,8 +177,7 @@ def trains(command, folder):
     """Take the command that was printed, for a few steps; its last losses."""
     words = shlex.split(command)
     assert words.pop(0) == "coliags"
-    small = [word for override in SMALL for word in ("--set", override)]
-    assert run(*words, "--output", folder, "--steps", 2, "--renderer", "torch", *small) == 0
+    assert run(*words, "--output", folder, "--steps", 2, "--renderer", "torch", *SETS) == 0
     return json.loads((folder / "metrics.jsonl").read_text().splitlines()[-1])["terms"]
 
 

@@ -17,7 +17,7 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.gaussians import rotation_matrices
 from coliags_plugin.engine.rendering import CameraPath, Keyframe
 from tests.commands import refused, run
-from tests.scenes import SMALL, write_wall
+from tests.scenes import SETS, write_wall
 
 LIKE = Camera(20.0, 20.0, 15.0, 12.0, 32, 24, torch.eye(4), 0.1)
 
@@ -83,8 +83,7 @@ def test_a_file_is_read_as_it_was_written_and_what_is_no_path_is_refused(tmp_pat
 
 def test_the_video_of_a_path(tmp_path, capsys):
     wall = write_wall(tmp_path / "wall")
-    argv = [part for setting in SMALL for part in ("--set", setting)]
-    assert run("train", "coliags", "--data", wall, "--output", tmp_path / "run", "--steps", 2, *argv) == 0
+    assert run("train", "coliags", "--data", wall, "--output", tmp_path / "run", "--steps", 2, *SETS) == 0
     start, end = (frame.camera for frame in cp.load_run(tmp_path / "run").load().scene.train[:2])
     CameraPath(keyframes=(Keyframe.of(start), Keyframe.of(end)), seconds=0.5).write(tmp_path / "path.json")
     assert run("render", tmp_path / "run", "--path", tmp_path / "path.json", "--fps", 10) == 0

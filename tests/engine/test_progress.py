@@ -17,7 +17,7 @@ from coliags_plugin.engine.loggers import TensorBoardLogger, WandbLogger, find_l
 from coliags_plugin.engine.progress import ProgressReport, progress_callback
 from tests.commands import refused, run
 from tests.engine.test_trainer import log_rows, make_trainer, without_clock
-from tests.scenes import SMALL, write_wall
+from tests.scenes import SETS, write_wall
 
 
 @pytest.fixture
@@ -84,8 +84,6 @@ def test_a_notebook_shows_one_line_that_changes(clock, monkeypatch, capsys):
 
 
 # Loggers
-
-SETS = [part for override in SMALL for part in ("--set", override)]
 
 
 def logged(path) -> dict[str, dict[int, float]]:
