@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field
 
 import torch
@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from coliags_plugin.core.cameras import Camera
-from coliags_plugin.core.errors import InputError, did_you_mean
+from coliags_plugin.core.errors import InputError, check_name
 from coliags_plugin.core.gaussians import Gaussians
 
 #: All outputs of renderers besides a field's own feature channels. "depth" alone names nothing: each kind
@@ -114,12 +114,10 @@ class RenderOutput:
         return self.maps[name]
 
 
-def check_outputs(wants: Iterable[str], names: Iterable[str]) -> None:
+def check_outputs(wants: Iterable[str], names: Collection[str]) -> None:
     """Refuse outputs that a renderer does not have."""
-    names = tuple(names)
     for name in wants:
-        if name not in names:
-            raise InputError(f"no renderer output '{name}'", f"some of {', '.join(names)}", did_you_mean(name, names))
+        check_name("renderer output", name, names)
 
 
 def concatenate_pixels(parts: Sequence[RenderOutput]) -> RenderOutput:

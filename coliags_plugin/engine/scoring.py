@@ -289,13 +289,15 @@ class ErrorProfiles:
     are :data:`DISTANCE_EDGES`.
     """
 
-    def __init__(self, unit: str = "mm", scale: float = 1.0) -> None:
-        self._distance = _Bins(unit, tuple(edge / scale for edge in DISTANCE_EDGES))
-        self._angle = _Bins("degrees", ANGLE_EDGES)
+    def __init__(self, unit: str, scale: float) -> None:
+        distances = tuple(edge / scale for edge in DISTANCE_EDGES)
+        self._edges = {"distance": (unit, distances), "angle": ("degrees", ANGLE_EDGES)}
+        #: Number of pixels, and sums of squared colour and depth errors, in each bin.
+        self._sums = {name: np.zeros((3, len(edges) - 1)) for name, (_, edges) in self._edges.items()}
         self._frames = 0
 
     def add(self, comparison: Comparison, frame: Frame) -> None:
-        """Add the pixels of a frame; none where it has no true depth."""
+        """Add the pixels of a frame; none where it has no true depth. A bin holds its lower edge."""
         if frame.depth is None or comparison.depth is None or comparison.true_depth is None:
             return
         depth, compared = _float64(frame.depth), comparison.valid
@@ -305,45 +307,26 @@ class ErrorProfiles:
         tangents = _tangents(frame.camera)
         rgb = np.square(_float64(comparison.rgb) - _float64(comparison.true_rgb)).mean(axis=-1)
         z = np.square(_float64(comparison.depth) - _float64(comparison.true_depth))
-        self._distance.add((depth * np.hypot(1.0, tangents))[counts], rgb[counts], z[counts])
-        self._angle.add(np.degrees(np.arctan(tangents))[counts], rgb[counts], z[counts])
+        places = {"distance": depth * np.hypot(1.0, tangents), "angle": np.degrees(np.arctan(tangents))}
+        for name, place in places.items():
+            _, edges = self._edges[name]
+            bins = np.searchsorted(edges, place[counts], side="right") - 1
+            inside = (bins >= 0) & (bins < len(edges) - 1)
+            weights = (values[counts][inside] for values in (np.ones_like(rgb), rgb, z))
+            self._sums[name] += [np.bincount(bins[inside], values, len(edges) - 1) for values in weights]
         self._frames += 1
 
     def records(self) -> dict[str, ProfileRecord]:
         """Profiles over distance and angle; empty where no frame had true depth."""
-        return {"distance": self._distance.record(), "angle": self._angle.record()} if self._frames else {}
-
-
-class _Bins:
-    def __init__(self, unit: str, edges: tuple[float, ...]) -> None:
-        self.unit, self.edges = unit, edges
-        self.pixels = np.zeros(len(edges) - 1, dtype=np.int64)
-        self.rgb, self.depth = np.zeros(len(edges) - 1), np.zeros(len(edges) - 1)
-
-    def add(self, where: Float[np.ndarray, "P"], rgb: Float[np.ndarray, "P"], depth: Float[np.ndarray, "P"]) -> None:
-        """Add squared errors of pixels; a bin holds its lower edge."""
-        index = np.searchsorted(self.edges, where, side="right") - 1
-        inside = (index >= 0) & (index < len(self.pixels))
-        index, bins = index[inside], len(self.pixels)
-        self.pixels += np.bincount(index, minlength=bins)
-        self.rgb += np.bincount(index, rgb[inside], bins)
-        self.depth += np.bincount(index, depth[inside], bins)
-
-    def record(self) -> ProfileRecord:
-        """Means per bin."""
-        return ProfileRecord(
-            unit=self.unit,
-            edges=self.edges,
-            pixels=tuple(self.pixels.tolist()),
-            rgb_mse=self._means(self.rgb),
-            depth_mse=self._means(self.depth),
-        )
-
-    def _means(self, sums: Float[np.ndarray, "B"]) -> tuple[float | None, ...]:
-        return tuple(
-            float(total / count) if count and np.isfinite(total) else None
-            for total, count in zip(sums, self.pixels, strict=True)
-        )
+        records = {}
+        for name, (unit, edges) in self._edges.items() if self._frames else ():
+            counts, *sums = self._sums[name]
+            with np.errstate(divide="ignore", invalid="ignore"):
+                means = (np.array(sums) / counts).tolist()
+            rgb, depth = (tuple(mean if math.isfinite(mean) else None for mean in row) for row in means)
+            pixels = tuple(map(int, counts))
+            records[name] = ProfileRecord(unit=unit, edges=edges, pixels=pixels, rgb_mse=rgb, depth_mse=depth)
+        return records
 
 
 def _tangents(camera: Camera) -> Float[np.ndarray, "H W"]:

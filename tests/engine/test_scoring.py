@@ -39,7 +39,7 @@ def view(camera, depth, rgb_error=0.1, depth_error=2.0, mask=None, depth_valid=N
 
 
 def profiles(*views, unit="mm"):
-    records = ErrorProfiles(unit)
+    records = ErrorProfiles(unit, 1.0)
     for compared, frame in views:
         records.add(compared, frame)
     return records.records()
