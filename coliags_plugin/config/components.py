@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import Annotated, Any
@@ -73,11 +73,6 @@ def is_auto(kind: str, name: object) -> bool:
 def candidates(kind: str) -> list[str]:
     """Names of the components of a kind that ``auto`` may stand for."""
     return [name for name in REGISTRIES[kind] if not is_auto(kind, name)]
-
-
-def resolved(component: Component, choose: Callable[[], str]) -> Component:
-    """A component, or the one that ``auto`` stands for, as ``choose`` says, with the options that were set."""
-    return with_options(component, choose()) if is_auto(component.kind, component.name) else component
 
 
 def with_options(auto: Component, name: str) -> Component:

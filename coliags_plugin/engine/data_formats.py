@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from coliags_plugin.config import registry
-from coliags_plugin.config.components import Component, candidates, is_auto, named_component, resolved
+from coliags_plugin.config.components import Component, candidates, is_auto, named_component, with_options
 from coliags_plugin.config.method_config import LoadedMethod, MethodConfig, load_method, method_tree
 from coliags_plugin.config.yaml_tree import Node, override_all
 from coliags_plugin.contracts import DataManager
@@ -145,7 +145,8 @@ def at_scale(scene: Scene, scale: float, near_plane: float) -> Scene:
 
 def data_manager(component: Component, path: Path) -> DataManager:
     """The data manager of a config; of ``auto``, the one that recognises the folder."""
-    chosen = resolved(component, lambda: find_format(path))
+    is_open = is_auto("datamanagers", component.name)
+    chosen = with_options(component, find_format(path)) if is_open else component
     manager: DataManager = chosen.target(chosen.settings)
     return manager
 
