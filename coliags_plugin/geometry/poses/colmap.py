@@ -284,7 +284,7 @@ def read(path: Path) -> Trajectory:
         )
     images = ordered_images(path / f"images{suffix}")
     used = [image.camera for image in images]
-    intrinsics, remark = _common(read_pinholes(path / f"cameras{suffix}"), set(used))
+    intrinsics, remark = _common(read_pinholes(path / f"cameras{suffix}"), used)
     keys = {} if intrinsics else {n: _keys(camera) for n, camera in read_cameras(path / f"cameras{suffix}").items()}
     cameras = [keys.get(number) for number in used]
     return Trajectory(
@@ -414,14 +414,14 @@ def read_pinholes(path: Path) -> dict[int, Intrinsics | str]:
     return pinholes
 
 
-def _common(cameras: dict[int, Intrinsics | str], used: set[int]) -> tuple[Intrinsics | None, str]:
+def _common(cameras: dict[int, Intrinsics | str], used: Sequence[int]) -> tuple[Intrinsics | None, str]:
     """The pinhole shared by all images; or None, and the reason."""
-    shared = [cameras[number] for number in sorted(used) if number in cameras]
-    others = [camera for camera in cameras.values() if isinstance(camera, str)]
-    if len(shared) < len(used) or any(isinstance(camera, str) for camera in shared):
-        reason = others[0] if others else "the model lacks a camera that an image names"
-        return None, f"no common pinhole: {reason}, not an undistorted pinhole"
-    pinholes = {camera for camera in shared if isinstance(camera, Intrinsics)}
+    pinholes = set()
+    for number in used:
+        camera = cameras.get(number, "the model lacks a camera that an image names")
+        if isinstance(camera, str):
+            return None, f"no common pinhole: {camera}, not an undistorted pinhole"
+        pinholes.add(camera)
     if len(pinholes) > 1:
         return None, f"no common pinhole: the images have {len(pinholes)} different cameras"
     return pinholes.pop(), ""

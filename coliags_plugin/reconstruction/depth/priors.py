@@ -58,20 +58,13 @@ class DepthRange:
     medians: tuple[float, ...]
 
 
-def given_range(near: float, far: float, count: int) -> DepthRange:
-    """The range that a user states; frames' medians are its geometric mean."""
-    if not 0.0 < near < far:
-        raise InputError(f"`near={near:g}` and `far={far:g}`", "0 < near < far")
-    return DepthRange(near, far, (float(np.sqrt(near * far)),) * count)
-
-
 def find_range(frames: Sequence[Frame], settings: FeatureSettings, progress: Progress | None = None) -> DepthRange:
     """Depth range from points triangulated between pairs of frames, or from sparse depth where the scene has some."""
     if any(frame.sparse_depth is not None and len(frame.sparse_depth.depth) for frame in frames):
         depths_by_frame = [
             np.zeros(0)
             if sparse is None
-            else _neighbourly(sparse.pixels.cpu().numpy(), sparse.depth.cpu().double().numpy())
+            else neighbourly(sparse.pixels.cpu().numpy(), sparse.depth.cpu().double().numpy())
             for sparse in (frame.sparse_depth for frame in frames)
         ]
         return _range_of(depths_by_frame, "points of the scene")
@@ -92,7 +85,7 @@ def find_range(frames: Sequence[Frame], settings: FeatureSettings, progress: Pro
                 for other in partners
             ]
             if depths:
-                depths_by_frame[index] = _neighbourly(features_of(index).pixels, _agreed(np.stack(depths)))
+                depths_by_frame[index] = neighbourly(features_of(index).pixels, _agreed(np.stack(depths)))
     return _range_of(depths_by_frame, "points triangulated between frames")
 
 
@@ -137,22 +130,16 @@ def _agreed(depths: Float[np.ndarray, "P K"]) -> Float[np.ndarray, "K"]:
     return np.where((near >= np.minimum(2, there)) & (2 * near > there), agreed, np.nan)
 
 
-def _neighbourly(pixels: Float[np.ndarray, "K 2"], depths: Float[np.ndarray, "K"]) -> Float[np.ndarray, "A"]:
-    """Depths of one frame that are known, above 0, and not unlike their neighbours'."""
+def neighbourly(pixels: Float[np.ndarray, "K 2"], depths: Float[np.ndarray, "K"]) -> Float[np.ndarray, "A"]:
+    """Depths of one frame that are known, above 0, and not unlike half of the nearest others; all of too few."""
     is_known = depths > 0.0
-    depths = depths[is_known]
-    return np.asarray(depths[~(difference_from_neighbours(pixels[is_known], np.log(depths)) > _UNLIKE)])
-
-
-def difference_from_neighbours(
-    pixels: Float[np.ndarray, "K 2"], log_depth: Float[np.ndarray, "K"]
-) -> Float[np.ndarray, "K"]:
-    """Difference of log depths of one frame from half of the nearest observations; NaN in a frame with too few."""
-    if len(pixels) <= _NEIGHBOURS:
-        return np.full(len(pixels), np.nan)
+    pixels, depths = pixels[is_known], depths[is_known]
+    if len(depths) <= _NEIGHBOURS:
+        return depths
     nearest = np.asarray(cKDTree(pixels).query(pixels, _NEIGHBOURS + 1)[1])[:, 1:]
+    log_depth = np.log(depths)
     differences = np.abs(log_depth[nearest] - log_depth[:, None])
-    return np.asarray(np.partition(differences, _AGREEING - 1, axis=1)[:, _AGREEING - 1])
+    return depths[~(np.partition(differences, _AGREEING - 1, axis=1)[:, _AGREEING - 1] > _UNLIKE)]
 
 
 def _range_of(depths_by_frame: Sequence[Float[np.ndarray, "K"]], what: str) -> DepthRange:

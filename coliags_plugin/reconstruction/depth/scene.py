@@ -20,7 +20,7 @@ from coliags_plugin.core.splits import split_options
 from coliags_plugin.datamanagers.nerfstudio import EstimatedSceneWriter
 from coliags_plugin.datamanagers.shots import PAPER_SIZE, fitted
 from coliags_plugin.reconstruction.depth.estimate import Estimation, check_video, work_folder
-from coliags_plugin.reconstruction.depth.priors import DepthRange, FilePrior, LightPrior, find_range, given_range
+from coliags_plugin.reconstruction.depth.priors import DepthRange, FilePrior, LightPrior, find_range
 from coliags_plugin.reconstruction.depth.sweeping import DepthEstimationSettings, Map, Mask
 from coliags_plugin.reconstruction.structure.features import Pose, image_and_mask
 
@@ -66,6 +66,8 @@ def estimate_scene(
     if others := [name for name in scene.test_sets if name != "test"]:
         log.warning("left out: %s, which are apart from the video", ", ".join(others))
     check_video(frames, sources)
+    if near_far is not None and not 0.0 < near_far[0] < near_far[1]:
+        raise InputError(f"`near={near_far[0]:g}` and `far={near_far[1]:g}`", "0 < near < far")
     depth_prior = LightPrior() if prior is None else FilePrior.of(prior, frames)
     described = {
         "version": _VERSION,
@@ -85,7 +87,7 @@ def estimate_scene(
             medians = np.exp(np.interp(np.arange(len(frames)), sources, np.log(measured["medians"])))
             depth_range = DepthRange(measured["near"], measured["far"], tuple(medians.tolist()))
         else:
-            depth_range = given_range(*near_far, len(frames))
+            depth_range = DepthRange(*near_far, (float(np.sqrt(near_far[0] * near_far[1])),) * len(frames))
         jobs = jobs or os.cpu_count() or 1
         estimation = Estimation(frames, sources, depth_prior, depth_range, settings, work, jobs, progress)
         estimation.run()

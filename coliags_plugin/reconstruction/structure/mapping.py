@@ -45,10 +45,8 @@ def map_tracks(database: Path, scratch: Path, settings: SfmSettings) -> list[pyc
     options.min_model_size = settings.min_model_size
     mapper = options.mapper
     options.num_threads = mapper.num_threads = 1
-    for seeded in (
-        *(options, mapper, mapper.retriangulation),
-        *(mapper.global_positioning, mapper.rotation_averaging),
-    ):
+    parts = mapper.retriangulation, mapper.global_positioning, mapper.rotation_averaging
+    for seeded in (options, mapper, *parts):
         seeded.random_seed = settings.seed
     mapper.global_positioning.use_gpu = mapper.bundle_adjustment.ceres.use_gpu = False
     mapper.bundle_adjustment.refine_focal_length = mapper.bundle_adjustment.refine_extra_params = False

@@ -18,10 +18,9 @@ from coliags_plugin.reconstruction.depth.priors import (
     FilePrior,
     LightPrior,
     complete,
-    difference_from_neighbours,
     find_range,
-    given_range,
     near_rim,
+    neighbourly,
     robust_fit,
     smooth_surface,
 )
@@ -70,7 +69,6 @@ def test_sparse_depth_of_the_scene_counts():
     assert depth_range.near == pytest.approx(0.6 * np.percentile(np.tile(depths, 4), 1.0), rel=1e-5)
     assert depth_range.far == pytest.approx(2.0 * np.percentile(np.tile(depths, 4), 99.0), rel=1e-5)
     np.testing.assert_allclose(depth_range.medians, 40.0, rtol=1e-5)
-    assert given_range(10.0, 40.0, 2).medians == (20.0, 20.0)
 
 
 def chosen(distances, axes=None, sources=None):
@@ -241,14 +239,12 @@ def test_files_that_do_not_fit_are_refused(tmp_path):
 
 def test_a_point_unlike_its_neighbours_stands_out_and_an_edge_does_not():
     pixels = np.stack(np.meshgrid(np.arange(12), np.arange(12)), axis=-1).reshape(-1, 2) * 5.0
-    log_depth = np.where(pixels[:, 0] < 30.0, 3.0, 4.0)
-    clean = difference_from_neighbours(pixels, log_depth)
-    np.testing.assert_array_equal(clean, 0.0)
-    log_depth[40] += 0.7
-    differences = difference_from_neighbours(pixels, log_depth)
-    assert differences[40] == pytest.approx(0.7)
-    np.testing.assert_array_equal(np.delete(differences, 40), 0.0)
-    assert np.isnan(difference_from_neighbours(pixels[:8], log_depth[:8])).all()
+    depths = np.where(pixels[:, 0] < 30.0, 20.0, 55.0)
+    np.testing.assert_array_equal(neighbourly(pixels, depths), depths)
+    depths[40], unknown = 2.0 * depths[40], depths * np.where(np.arange(144) == 7, np.nan, 1.0)
+    np.testing.assert_array_equal(neighbourly(pixels, depths), np.delete(depths, 40))
+    np.testing.assert_array_equal(neighbourly(pixels, unknown), np.delete(unknown, 7))
+    np.testing.assert_array_equal(neighbourly(pixels[33:41], depths[33:41]), depths[33:41])
 
 
 def zncc(first, second, floor):
