@@ -12,7 +12,7 @@ import logging
 from collections.abc import Sequence, Set
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from itertools import product
+from itertools import product, starmap
 
 import numpy as np
 from jaxtyping import Float, Float32, Int64
@@ -117,6 +117,7 @@ def stretches_of(models: Sequence[Sequence[int]], cuts: Set[int]) -> list[range]
 class _Posed:
     """A frame with a pose, and points of its model that it sees."""
 
+    model: Hypothesis
     number: int
     view: View
     points: Float[np.ndarray, "K 3"]  # of the view, world
@@ -159,11 +160,8 @@ class _Comparison:
         """
         firsts = self._posed(first_model, [frame for frame in first_model.frames if frame in earlier][-_FRAMES:])
         seconds = self._posed(second_model, [frame for frame in second_model.frames if frame in later][:_FRAMES])
-        attempts = []
-        for first, second in product(firsts, seconds):
-            attempts.append(self._sighting(first, second, second_model))
-            attempts.append(self._sighting(second, first, first_model, back=True))
-        sightings = [sighting for sighting in attempts if sighting is not None]
+        pairs = [pair for first, second in product(firsts, seconds) for pair in ((first, second), (second, first))]
+        sightings = [sighting for sighting in starmap(self._sighting, pairs) if sighting is not None]
         if not sightings:
             return []
         agreeing = _same(sightings, seconds[0])
@@ -185,11 +183,11 @@ class _Comparison:
                 view, tracks = self.view(frame), rays.tracks[rows]
                 view = view.with_points(rays.ids[tracks], view.from_image(rays.pixels[rows]))
                 pose = np.asarray(model.images[frame + 1].cam_from_world().matrix())
-                posed.append(_Posed(frame, view, points[tracks], pose))
+                posed.append(_Posed(part, frame, view, points[tracks], pose))
         return posed
 
-    def _sighting(self, source: _Posed, target: _Posed, seen_by: Hypothesis, back: bool = False) -> _Sighting | None:
-        """Find a frame's points in a frame of another model, the later one, or with ``back`` the earlier one."""
+    def _sighting(self, source: _Posed, target: _Posed) -> _Sighting | None:
+        """Find a frame's points in a frame of another model."""
         import pycolmap
 
         rows, moved = self.finder.find(source.view, target.view)
@@ -200,7 +198,7 @@ class _Comparison:
         options.ransac.random_seed = self.video.settings.seed
         options.ransac.min_num_trials, options.ransac.max_num_trials = _TRIALS
         pixels, points = target.view.in_image(moved), source.points[rows]
-        matches = pixels.astype(np.float64), points, seen_by.camera
+        matches = pixels.astype(np.float64), points, target.model.camera
         estimate = pycolmap.estimate_and_refine_absolute_pose(*matches, options)
         if estimate is None or estimate["num_inliers"] < _FEWEST_FOUND:
             return None
@@ -213,7 +211,7 @@ class _Comparison:
         depths = points[compared] @ pose[2, :3] + pose[2, 3]
         factor = float(np.exp(np.median(np.log(depths / target.depths[np.asarray(nearest)[compared]]))))
         frames, similarity = (source.number, target.number), _between(pose, target.pose, factor)
-        if back:
+        if source.number > target.number:
             frames, similarity = frames[::-1], _between(target.pose, pose, 1.0 / factor)
         return _Sighting(frames, target.number, source.view.ids[rows[fits]], pixels[fits], similarity)
 
