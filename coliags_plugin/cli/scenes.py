@@ -170,13 +170,13 @@ class DepthCommand:
             reading = ["initial_points=none", "keep_pixels=false", *of_manager]
             scene = open_scene(self.scene, self.data_format, reading, progress)
             near_far = None if self.near is None or self.far is None else (self.near, self.far)
-            estimated = estimate_scene(
+            summary, warnings = estimate_scene(
                 scene, self.output, settings, near_far, self.prior, self.jobs, self.overwrite, progress
             )
-        for warning in estimated.warnings:
+        for warning in warnings:
             log.warning(warning)
         train = train_command(self.output, ESTIMATED_DEPTH_METHOD, training_options(scene))
-        print_summary(estimated.summary, written=[self.output], then=[train], as_json=self.json)
+        print_summary(summary, written=[self.output], then=[train], as_json=self.json)
 
 
 @dataclass(frozen=True)

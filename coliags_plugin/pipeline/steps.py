@@ -310,11 +310,11 @@ def estimate_depth(context: StageContext) -> StageRecord:
     """Estimate dense depth with its confidence; goes on where a kill has left it."""
     from coliags_plugin.reconstruction.depth.scene import estimate_scene
 
-    estimated = estimate_scene(
+    summary, warnings = estimate_scene(
         context.open_posed(), context.scene, context.settings.depth, overwrite=True, progress=context.progress
     )
     files = {"depth": "scene in nerfstudio's layout: images, poses, depth, confidence, points"}
-    return StageRecord(estimated.summary, files, estimated.warnings)
+    return StageRecord(summary, files, warnings)
 
 
 def steps_for(context: StageContext) -> int:

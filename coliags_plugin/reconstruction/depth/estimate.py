@@ -217,9 +217,10 @@ class Estimation:
 
         def fused(index: int) -> Arrays:
             weighted, guide = depth_map(index), guides(index)
-            result = fuse_frame(weighted, [depth_map(other) for other in neighbours[index]], self.settings.agreement)
+            others = [depth_map(other) for other in neighbours[index]]
             # Where this frame shows a highlight, others may see the surface.
-            support, log_fused = result.votes, np.log(result.depth)
+            depth, support, spread = fuse_frame(weighted, others, self.settings.agreement)
+            log_fused = np.log(depth)
             prior = self.prior.log_depth(
                 self.frames[index].to("cpu"), guide.usable, log_fused, data_weight(support), self.medians[index]
             )
@@ -229,7 +230,7 @@ class Estimation:
             whole = sweep.reach is None
             belief = first_belief(log_fused, support, prior, rim) if whole else np.ones_like(support)
             log_depth = np.clip(complete(log_fused, support, belief, prior, guide.intensity), low, high)
-            confidence = depth_confidence(log_depth, support, result.spread, rim)
+            confidence = depth_confidence(log_depth, support, spread, rim)
             matched = float(weighted.weight[guide.usable].mean()) if guide.usable.any() else 0.0
             distrust = ""
             if len(neighbours[index]) < FEWEST_NEIGHBOURS:

@@ -6,7 +6,6 @@ import logging
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Float32, Int, UInt8
@@ -34,13 +33,6 @@ _VERSION = 6
 _VOXEL = 2.0
 
 
-class EstimatedDepth(NamedTuple):
-    """Summary of estimated depth, in words."""
-
-    summary: str
-    warnings: list[str]  # for each reason, which frames have confidence 0 throughout
-
-
 def estimate_scene(
     scene: Scene,
     out: Path,
@@ -50,7 +42,7 @@ def estimate_scene(
     jobs: int | None = None,
     overwrite: bool = False,
     progress: Progress | None = None,
-) -> EstimatedDepth:
+) -> tuple[str, list[str]]:
     """Estimate the depth of a posed scene's video, and write it as a scene in nerfstudio's layout.
 
     The depth of training frames, the range and the points are made of training frames alone; that of a test frame of
@@ -58,7 +50,8 @@ def estimate_scene(
     is written, and the same request resumes from them.
 
     ``near_far`` is the depth range, scene units, which is found where it is None; ``prior`` a folder of depth maps in
-    place of the brightness; ``jobs`` the number of threads, one for each core by default.
+    place of the brightness; ``jobs`` the number of threads, one for each core by default. Returns a summary and
+    warnings: for each reason, which frames have confidence 0 throughout.
     """
     frames = scene.video
     trained = {frame.name for frame in scene.train}
@@ -92,8 +85,8 @@ def estimate_scene(
         estimation = Estimation(frames, sources, depth_prior, depth_range, settings, work, jobs, progress)
         estimation.run()
         with atomic_folder(out, overwrite) as folder:
-            estimated = _write(scene, frames, estimation, folder, progress)
-    return estimated
+            summary, warnings = _write(scene, frames, estimation, folder, progress)
+    return summary, warnings
 
 
 def training_options(scene: Scene) -> list[str]:
@@ -107,7 +100,7 @@ def training_options(scene: Scene) -> list[str]:
 
 def _write(
     scene: Scene, frames: Sequence[Frame], estimation: Estimation, folder: Path, progress: Progress | None
-) -> EstimatedDepth:
+) -> tuple[str, list[str]]:
     writer = EstimatedSceneWriter(folder, estimation.range.far / 65000.0)
     k = frames[0].camera
     typical = np.median([estimation.medians[index] for index in estimation.sources])
@@ -146,7 +139,7 @@ def _write(
         f"{len(names)} of {len(frames)} frames have depth of confidence 0, {reason}: {', '.join(names)}"
         for reason, names in distrusted.items()
     ]
-    return EstimatedDepth(summary, warnings)
+    return summary, warnings
 
 
 #: Least confidence of a pixel, and least number of frames that see a point's voxel.

@@ -157,20 +157,14 @@ class WeightedDepth:
     weight: Map  # 0 where it does not count
 
 
-@dataclass(frozen=True, eq=False)
-class Fused:
-    """Depth that a frame and its neighbours agree on."""
-
-    depth: Map  # z-depth; the frame's own where no other counts
-    votes: Map  # weight of the frames that agree with it
-    spread: Map  # mean relative deviation within the group
-
-
-def fuse_frame(frame: WeightedDepth, neighbours: Sequence[WeightedDepth], agreement: float) -> Fused:
+def fuse_frame(frame: WeightedDepth, neighbours: Sequence[WeightedDepth], agreement: float) -> tuple[Map, Map, Map]:
     """Weighted median of the depths that a frame and its neighbours give to each pixel, within the densest group.
 
     A neighbour's depth of a pixel is where the pixel's ray meets the neighbour's surface, found by fixed-point
     iteration from the frame's own depth. Depths agree up to a relative difference of ``agreement``.
+
+    Returns the z-depth, the frame's own where no other counts; the weight of the frames that agree with it; and the
+    mean relative deviation within the group.
     """
     from coliags_plugin.core.numba_kernels.lanes import WIDTH
     from coliags_plugin.reconstruction.depth.numba_kernels.kernels import reproject, vote
@@ -187,7 +181,8 @@ def fuse_frame(frame: WeightedDepth, neighbours: Sequence[WeightedDepth], agreem
         reproject(depth, width, other.depth, other.weight, *there, *back, _ITERATIONS, np.float32(_CONVERGED), *outputs)
     written = np.empty((3, len(depth)), np.float32)
     vote(depth, weight, candidates, trusts, np.float32(agreement), *written)
-    return Fused(*written[:, :size].reshape(3, height, width))
+    fused, votes, spread = written[:, :size].reshape(3, height, width)
+    return fused, votes, spread
 
 
 #: Of the regression: constant, log support, log spread, near side of an edge, log depth across a window.

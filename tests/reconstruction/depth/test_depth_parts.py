@@ -405,7 +405,7 @@ def test_fusion_repairs_a_wrong_depth():
         maps.append(WeightedDepth(Pose.of(frame.camera), depth, np.ones_like(depth)))
     truth = maps[2].depth.copy()
     maps[2].depth[30:40, 40:50] *= 1.04
-    fused = fuse_frame(maps[2], [maps[k] for k in (0, 1, 3, 4)], 0.02)
+    fused, votes, _ = fuse_frame(maps[2], [maps[k] for k in (0, 1, 3, 4)], 0.02)
     inner = (slice(8, -8), slice(12, -12))
-    np.testing.assert_allclose(fused.depth[inner], truth[inner], rtol=3e-3)
-    assert fused.votes[20, 45] == 5.0 and fused.votes[35, 45] == 4.0
+    np.testing.assert_allclose(fused[inner], truth[inner], rtol=3e-3)
+    assert votes[20, 45] == 5.0 and votes[35, 45] == 4.0
