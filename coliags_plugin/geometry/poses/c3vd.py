@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_write
-from coliags_plugin.geometry.poses.formats import Format, first_row, read_numbers
+from coliags_plugin.geometry.poses.formats import Format, count_first_numbers, read_numbers
 from coliags_plugin.geometry.poses.trajectory import RIGID_TOLERANCE, Trajectory, check_rigid
 
 
@@ -93,4 +93,4 @@ def matrix_lines(camera_to_world: Float[np.ndarray, "N 4 4"], digits: int | None
     return "\n".join(lines) + "\n"
 
 
-FORMAT = Format("c3vd", read, write, lambda path: first_row(path)[1] == 16, unit="mm")
+FORMAT = Format("c3vd", read, write, lambda path: count_first_numbers(path) == 16, unit="mm")

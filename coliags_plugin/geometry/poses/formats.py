@@ -54,7 +54,7 @@ def format_of(path: Path, name: str | None = None) -> Format:
         raise InputError(
             f"{path} holds {shown or 'nothing'}", "the folder of a COLMAP model, or a pose file inside a folder"
         )
-    line, count = first_row(path)
+    line, count = _first_row(path)
     raise unreadable(
         path,
         f"{path} has no known pose format: its first line holds "
@@ -113,7 +113,12 @@ def read_numbers(
     return rows
 
 
-def first_row(path: Path) -> tuple[str, int | None]:
+def count_first_numbers(path: Path) -> int | None:
+    """Count of numbers in the first line of a text file behind comments and names; None if it holds anything else."""
+    return _first_row(path)[1]
+
+
+def _first_row(path: Path) -> tuple[str, int | None]:
     """The first line of a text file behind comments and names, and its count of numbers, None if others are there."""
     for line in head_text(path).splitlines():
         words = _words(line)

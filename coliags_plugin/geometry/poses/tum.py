@@ -11,7 +11,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from coliags_plugin.core.files import atomic_write
-from coliags_plugin.geometry.poses.formats import Format, first_row, head_text, read_numbers
+from coliags_plugin.geometry.poses.formats import Format, count_first_numbers, head_text, read_numbers
 from coliags_plugin.geometry.poses.trajectory import (
     ZERO_QUATERNION,
     Trajectory,
@@ -95,4 +95,4 @@ def write(path: Path, trajectory: Trajectory) -> None:
     atomic_write(path, "\n".join(["# timestamp tx ty tz qx qy qz qw", *lines]) + "\n")
 
 
-FORMAT = Format("tum", read, write, lambda path: first_row(path)[1] == 8, keeps=frozenset({"timestamps"}))
+FORMAT = Format("tum", read, write, lambda path: count_first_numbers(path) == 8, keeps=frozenset({"timestamps"}))
