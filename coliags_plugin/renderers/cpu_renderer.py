@@ -19,8 +19,8 @@ from coliags_plugin.core.render_output import RenderOutput, Splats
 from coliags_plugin.renderers.projection import slope_limits
 from coliags_plugin.renderers.splatting import CutSettings, SplattingRenderer, check_gaussian_outputs, is_surfels
 
-#: Tensors of the Gaussians and the width of their rows; None for one-dimensional ones. Surfels have two scales.
-_SHAPES = {"means": 3, "quats_wxyz": 4, "scales": 3, "opacities": None, "colors": 3}
+#: Tensors of the Gaussians in the order of ``layout.Parameters``.
+_TENSORS = ("means", "quats_wxyz", "scales", "opacities", "colors")
 #: Output by name of the kernels' image.
 _IMAGES = {
     "rgb": "rgb",
@@ -48,58 +48,39 @@ class CpuRenderer(SplattingRenderer[CutSettings]):
         return Availability(True, f"numba kernels on {torch.get_num_threads()} threads")
 
     def draw(self, gaussians: Gaussians, camera: Camera, wants: Sequence[str]) -> RenderOutput:
-        """Draw Gaussians by :func:`render_gaussians`."""
-        return render_gaussians(gaussians, camera, wants, self.settings)
+        """Draw Gaussians; the first call on a machine compiles the kernels, which takes about ten seconds.
 
+        Raises:
+            InputError: An output is unknown or not of these Gaussians; a tensor is of the wrong shape, dtype or device;
+                a Gaussian is not finite, has a quaternion of length 0 or a negative scale; the camera cannot be used.
+        """
+        from coliags_plugin.renderers.numba_kernels import pipeline
 
-def render_gaussians(
-    gaussians: Gaussians,
-    camera: Camera,
-    wants: Sequence[str] = ("rgb", "alpha"),
-    settings: CutSettings | None = None,
-) -> RenderOutput:
-    """Render float32 3D Gaussians on the CPU, or surfels where they have two scales, from a camera.
-
-    Everything but ``radii`` and, of 3D Gaussians, ``depth_median`` is differentiable, once, in the Gaussians and in
-    ``camera.camera_to_world``; ``means2d.grad`` is set by ``backward``. The first call on a machine compiles the
-    kernels, which takes about ten seconds.
-
-    Raises:
-        InputError: An output is unknown or not of these Gaussians; a tensor is of the wrong shape, dtype or device; a
-            Gaussian is not finite, has a quaternion of length 0 or a negative scale; the camera cannot be used.
-    """
-    from coliags_plugin.renderers.numba_kernels import pipeline
-
-    settings = settings or CutSettings()
-    check_gaussian_outputs(wants, gaussians)
-    _check_tensors(gaussians)
-    pose = camera.camera_to_world.to(device="cpu", dtype=torch.float32)
-    wanted = {image for image, name in _IMAGES.items() if name in ("rgb", "alpha", *wants)}
-    if "expected" in wanted:
-        wanted.add("depth")
-    primitive = pipeline.SURFELS if is_surfels(gaussians) else pipeline.GAUSSIANS
-    view = _view_table(camera, pose, settings)
-    stages = pipeline.Pipeline(primitive, view, camera.width, camera.height, wanted)
-    channels = [name for name in wants if name in gaussians.features]
-    try:
-        means2d, radii, images, features = pipeline.render(
-            [getattr(gaussians, name) for name in _SHAPES],
-            [gaussians.features[name] for name in channels],
-            pose,
-            stages,
-        )
-    except pipeline.UnusableGaussianError:
-        raise _unusable(gaussians) from None
-    except pipeline.TooManyPairsError as error:
-        raise InputError(
-            f"{len(gaussians)} Gaussians that cover {error} tiles of 16 x 16 pixels, counted for each",
-            "less than 2^31",
-            "Check their scales",
-        ) from None
-    by_name = {name: images[image] for image, name in _IMAGES.items()}
-    by_name |= dict(zip(channels, features, strict=True))
-    maps = {name: by_name[name] for name in wants if name not in ("rgb", "alpha")}
-    return RenderOutput(by_name["rgb"], by_name["alpha"], camera, maps, Splats(gaussians, means2d, radii))
+        check_gaussian_outputs(wants, gaussians)
+        self.check_tensors(gaussians)
+        pose = camera.camera_to_world.to(device="cpu", dtype=torch.float32)
+        images = {image for image, name in _IMAGES.items() if name in ("rgb", "alpha", *wants)}
+        if "expected" in images:
+            images.add("depth")
+        primitive = pipeline.SURFELS if is_surfels(gaussians) else pipeline.GAUSSIANS
+        view = _view_table(camera, pose, self.settings)
+        stages = pipeline.Pipeline(primitive, view, camera.width, camera.height, images)
+        channels = {name: gaussians.features[name] for name in wants if name in gaussians.features}
+        tensors = [getattr(gaussians, name) for name in _TENSORS]
+        try:
+            means2d, radii, drawn, features = pipeline.render(tensors, list(channels.values()), pose, stages)
+        except pipeline.UnusableGaussianError:
+            raise _unusable(gaussians) from None
+        except pipeline.TooManyPairsError as error:
+            raise InputError(
+                f"{len(gaussians)} Gaussians that cover {error} tiles of 16 x 16 pixels, counted for each",
+                "less than 2^31",
+                "Check their scales",
+            ) from None
+        by_name = {name: drawn[image] for image, name in _IMAGES.items()}
+        by_name |= dict(zip(channels, features, strict=True))
+        maps = {name: by_name[name] for name in wants if name not in ("rgb", "alpha")}
+        return RenderOutput(by_name["rgb"], by_name["alpha"], camera, maps, Splats(gaussians, means2d, radii))
 
 
 def _view_table(camera: Camera, pose: Tensor, settings: CutSettings) -> np.ndarray:
@@ -124,34 +105,9 @@ def _view_table(camera: Camera, pose: Tensor, settings: CutSettings) -> np.ndarr
     return np.array(table, np.float32)
 
 
-def _check_tensors(gaussians: Gaussians) -> None:
-    """Check shape, dtype and device; values are checked during projection."""
-    count = len(gaussians.means) if gaussians.means.ndim else 0
-    shapes = {**_SHAPES, "scales": 2 if is_surfels(gaussians) else 3}
-    checked = [(name, getattr(gaussians, name), width) for name, width in shapes.items()]
-    checked += [(f"feature {name}", value, value.shape[1]) for name, value in gaussians.features.items()]
-    for name, tensor, width in checked:
-        shape = (count,) if width is None else (count, width)
-        if tuple(tensor.shape) != shape:
-            raise InputError(
-                f"{name} of shape {list(tensor.shape)}",
-                f"{list(shape)}, for means of shape {list(gaussians.means.shape)}",
-            )
-        if tensor.dtype != torch.float32:
-            raise InputError(
-                f"{name} of dtype {str(tensor.dtype).removeprefix('torch.')} for the cpu renderer",
-                "float32",
-                "Cast it, or choose the torch renderer, which computes in float64 too",
-            )
-        if tensor.device.type != "cpu":
-            raise InputError(
-                f"{name} on {tensor.device} for the cpu renderer", "tensors on the cpu", "Choose the torch renderer"
-            )
-
-
 def _unusable(gaussians: Gaussians) -> InputError:
     """The error for the first invalid Gaussian."""
-    for name in _SHAPES:
+    for name in _TENSORS:
         values = getattr(gaussians, name).detach()
         wrong = ~values.isfinite().reshape(len(values), -1).all(dim=1)
         if wrong.any():

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -103,38 +103,67 @@ class SplattingRenderer(Renderer[SplattingT, GaussianField]):
         if isinstance(self.settings, CutSettings):
             self.settings.distortion_slope(near_plane)
 
+    def check_tensors(self, gaussians: Gaussians) -> None:
+        """Refuse Gaussians that are malformed, not float32, or on a device that this renderer does not serve."""
+        count = len(gaussians.means) if gaussians.means.ndim else 0
+        scales = 2 if is_surfels(gaussians) else 3
+        widths = {"means": 3, "quats_wxyz": 4, "scales": scales, "opacities": None, "colors": 3}
+        checked = [(name, getattr(gaussians, name), width) for name, width in widths.items()]
+        checked += [(f"feature {name}", value, value.shape[1]) for name, value in gaussians.features.items()]
+        for name, tensor, width in checked:
+            shape = (count,) if width is None else (count, width)
+            if tuple(tensor.shape) != shape:
+                raise InputError(
+                    f"{name} of shape {list(tensor.shape)}",
+                    f"{list(shape)}, for means of shape {list(gaussians.means.shape)}",
+                )
+            if tensor.dtype != torch.float32:
+                raise InputError(
+                    f"{name} of dtype {str(tensor.dtype).removeprefix('torch.')} for the {self.name} renderer",
+                    "float32",
+                    "Cast it, or choose the torch renderer, which computes in float64 too",
+                )
+            if tensor.device.type not in self.devices:
+                raise InputError(
+                    f"{name} on {tensor.device} for the {self.name} renderer",
+                    f"tensors on {', '.join(sorted(self.devices))}",
+                    "Move the field there, or choose renderer 'auto'",
+                )
+
     @abstractmethod
     def draw(self, gaussians: Gaussians, camera: Camera, wants: Sequence[str]) -> RenderOutput:
-        """Render the Gaussians from the camera."""
+        """Render the Gaussians from the camera: surfels where they have two scales.
+
+        Everything but ``radii`` and, of 3D Gaussians, ``depth_median`` is differentiable, once, in the Gaussians and in
+        ``camera.camera_to_world``; ``means2d.grad`` is set by ``backward``.
+
+        Raises:
+            InputError: An output is unknown or not of these Gaussians, or these cannot be drawn.
+        """
 
 
-@dataclass(frozen=True)
-class DrawnView:
-    """Composited images of one view.
+def output_of(
+    gaussians: Gaussians,
+    camera: Camera,
+    wants: Sequence[str],
+    maps: dict[str, Float[Tensor, "H W *C"]],
+    means2d: Float[Tensor, "N 2"],
+    radii: Float[Tensor, "N"],
+) -> RenderOutput:
+    """Output of a renderer, from composited images by name; ``means2d`` then retains its gradient.
 
-    ``maps`` are the other outputs, and the accumulated depth if the expected is wanted: [H, W] or [H, W, C].
+    ``depth_expected`` is made from ``depth_accumulated``.
     """
-
-    rgb: Float[Tensor, "H W 3"]
-    alpha: Float[Tensor, "H W"]
-    maps: dict[str, Tensor]
-    means2d: Float[Tensor, "N 2"]
-    radii: Float[Tensor, "N"]
-
-    def output(self, gaussians: Gaussians, camera: Camera, wants: Sequence[str]) -> RenderOutput:
-        """Output of a renderer for this view; ``means2d`` then retains its gradient."""
-        maps = {}
-        for name in wants:
-            if name == "depth_expected":
-                # 0, and no gradient, where alpha is 0.
-                covered = self.alpha > 0
-                depth = self.maps["depth_accumulated"] / torch.where(covered, self.alpha, 1.0)
-                maps[name] = torch.where(covered, depth, 0.0)
-            elif name not in ("rgb", "alpha"):
-                maps[name] = self.maps[name]
-        if self.means2d.requires_grad:
-            self.means2d.retain_grad()
-        return RenderOutput(self.rgb, self.alpha, camera, maps, Splats(gaussians, self.means2d, self.radii))
+    maps = {**maps}
+    if "depth_expected" in wants:
+        # 0, and no gradient, where alpha is 0.
+        covered = maps["alpha"] > 0
+        depth = maps["depth_accumulated"] / torch.where(covered, maps["alpha"], 1.0)
+        maps["depth_expected"] = torch.where(covered, depth, 0.0)
+    if means2d.requires_grad:
+        means2d.retain_grad()
+    further = {name: maps[name] for name in wants if name not in ("rgb", "alpha")}
+    return RenderOutput(maps["rgb"], maps["alpha"], camera, further, Splats(gaussians, means2d, radii))
 
 
 def split_channels(sums: Float[Tensor, "H W F"], features: dict[str, Tensor]) -> dict[str, Tensor]:
@@ -160,26 +189,6 @@ def is_surfels(gaussians: Gaussians) -> bool:
             f"Gaussians with scales of shape {list(scales.shape)}", "three scales each, [N, 3], or two for surfels"
         )
     return scales.shape[1] == 2
-
-
-def check_device(gaussians: Gaussians, devices: Collection[str], renderer: str) -> None:
-    """Refuse Gaussians that are on a device that a renderer does not serve."""
-    if gaussians.means.device.type not in devices:
-        raise InputError(
-            f"Gaussians on {gaussians.means.device.type} for the {renderer} renderer",
-            f"Gaussians on {', '.join(sorted(devices))}",
-            "Move the field there, or choose renderer 'auto'",
-        )
-
-
-def check_float32(gaussians: Gaussians, renderer: str) -> None:
-    """Refuse Gaussians of another dtype."""
-    if gaussians.means.dtype != torch.float32:
-        raise InputError(
-            f"Gaussians of dtype {str(gaussians.means.dtype).removeprefix('torch.')} for the {renderer} renderer",
-            "float32",
-            "Cast them, or choose the torch renderer, which computes in float64 too",
-        )
 
 
 def check_gaussian_outputs(wants: Iterable[str], gaussians: Gaussians) -> None:

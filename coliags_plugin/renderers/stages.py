@@ -15,9 +15,9 @@ from coliags_plugin.core.render_output import RenderOutput
 from coliags_plugin.core.tensors import constant
 from coliags_plugin.renderers.splatting import (
     CutSettings,
-    DrawnView,
     check_gaussian_outputs,
     is_surfels,
+    output_of,
     split_channels,
 )
 from coliags_plugin.renderers.tiles import TileGrid, TilePairs
@@ -90,15 +90,18 @@ def draw_view(
     grid: TileGrid,
     stages: Stages,
 ) -> RenderOutput:
-    """Render 3D Gaussians, or surfels where they have two scales; see :func:`torch_renderer.render_gaussians`."""
+    """Render 3D Gaussians, or surfels where they have two scales; see :class:`SplattingRenderer`."""
     check_gaussian_outputs(wants, gaussians)
     draw = _draw_surfels if is_surfels(gaussians) else _draw_gaussians
-    return draw(gaussians, camera, wants, settings, grid, stages).output(gaussians, camera, wants)
+    maps, placed = draw(gaussians, camera, wants, settings, grid, stages)
+    if any(settings.background):
+        maps["rgb"] = maps["rgb"] + (1 - maps["alpha"])[..., None] * constant(settings.background, maps["alpha"])
+    return output_of(gaussians, camera, wants, maps, placed.means2d, placed.radii)
 
 
 def _draw_gaussians(
     gaussians: Gaussians, camera: Camera, wants: Sequence[str], settings: CutSettings, grid: TileGrid, stages: Stages
-) -> DrawnView:
+) -> tuple[dict[str, Tensor], Placed]:
     placed = stages.place_gaussians(gaussians, camera, "normals" in wants, settings, grid)
     depth_channels: dict[str, Tensor] = {}
     if {"depth_accumulated", "depth_expected"} & {*wants}:
@@ -112,12 +115,12 @@ def _draw_gaussians(
     maps = split_channels(sums, features)
     if medians is not None:
         maps["depth_median"] = medians
-    return _over_background(maps, placed, settings)
+    return maps, placed
 
 
 def _draw_surfels(
     gaussians: Gaussians, camera: Camera, wants: Sequence[str], settings: CutSettings, grid: TileGrid, stages: Stages
-) -> DrawnView:
+) -> tuple[dict[str, Tensor], Placed]:
     placed = stages.place_surfels(gaussians, camera, "normals" in wants, settings, grid)
     features = _features(gaussians, placed, {}, wants)
     rules = SurfelRules(settings, camera.near_plane, bool({*_OF_SURFELS, "depth_expected"} & {*wants}))
@@ -128,14 +131,7 @@ def _draw_surfels(
         maps |= dict(zip(_OF_SURFELS, depths.unbind(-1), strict=True))
         # m = far / (far - near) (1 - near / z) is linear in 1 / z.
         maps["distortion"] = maps["distortion"] * settings.distortion_slope(camera.near_plane) ** 2
-    return _over_background(maps, placed, settings)
-
-
-def _over_background(maps: dict[str, Tensor], placed: Placed, settings: CutSettings) -> DrawnView:
-    rgb, alpha = maps["rgb"], maps["alpha"]
-    if any(settings.background):
-        rgb = rgb + (1 - alpha)[..., None] * constant(settings.background, alpha)
-    return DrawnView(rgb, alpha, maps, placed.means2d, placed.radii)
+    return maps, placed
 
 
 def _features(

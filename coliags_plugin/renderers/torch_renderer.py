@@ -39,27 +39,9 @@ class TorchRenderer(SplattingRenderer[TorchRendererSettings]):
         return Availability(True, "plain PyTorch, runs wherever PyTorch does")
 
     def draw(self, gaussians: Gaussians, camera: Camera, wants: Sequence[str]) -> RenderOutput:
-        """Draw Gaussians by :func:`render_gaussians`."""
-        return render_gaussians(gaussians, camera, wants, self.settings)
-
-
-def render_gaussians(
-    gaussians: Gaussians,
-    camera: Camera,
-    wants: Sequence[str] = ("rgb", "alpha"),
-    settings: TorchRendererSettings | None = None,
-) -> RenderOutput:
-    """Render 3D Gaussians, or surfels where they have two scales, from a camera, in their dtype and on their device.
-
-    Everything but ``radii`` and, of 3D Gaussians, ``depth_median`` is differentiable, once, in the Gaussians and in
-    ``camera.camera_to_world``; ``means2d.grad`` is set by ``backward``.
-
-    Raises:
-        InputError: An output is unknown or not of these Gaussians, or they have neither two nor three scales.
-    """
-    settings = settings or TorchRendererSettings()
-    grid = TileGrid(camera.width, camera.height, settings.tile_size)
-    return draw_view(gaussians, camera, wants, settings, grid, _STAGES)
+        """Draw Gaussians, in their dtype and on their device."""
+        grid = TileGrid(camera.width, camera.height, self.settings.tile_size)
+        return draw_view(gaussians, camera, wants, self.settings, grid, _STAGES)
 
 
 def _place_gaussians(

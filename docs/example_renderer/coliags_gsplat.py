@@ -20,12 +20,10 @@ from coliags_plugin.core.render_output import RenderOutput
 from coliags_plugin.core.tensors import constant
 from coliags_plugin.renderers.projection import facing
 from coliags_plugin.renderers.splatting import (
-    DrawnView,
     SplattingRenderer,
     SplattingSettings,
-    check_device,
-    check_float32,
     check_gaussian_outputs,
+    output_of,
     split_channels,
 )
 
@@ -53,13 +51,15 @@ class GsplatRenderer(SplattingRenderer[SplattingSettings]):
 
     def draw(self, gaussians: Gaussians, camera: Camera, wants: Sequence[str]) -> RenderOutput:
         """Render the Gaussians; everything but ``radii`` is differentiable, in them and in the pose."""
-        check_device(gaussians, self.devices, self.name)
-        check_float32(gaussians, self.name)
+        self.check_tensors(gaussians)
         check_gaussian_outputs(wants, gaussians)
         camera = camera.to(gaussians.means.device, gaussians.means.dtype)
-        return self._drawn(gaussians, camera, wants).output(gaussians, camera, wants)
+        return output_of(gaussians, camera, wants, *self._drawn(gaussians, camera, wants))
 
-    def _drawn(self, gaussians: Gaussians, camera: Camera, wants: Sequence[str]) -> DrawnView:
+    def _drawn(
+        self, gaussians: Gaussians, camera: Camera, wants: Sequence[str]
+    ) -> tuple[dict[str, Tensor], Tensor, Tensor]:
+        """Composited images by output, projected centres and radii."""
         if len(gaussians) == 0:  # gsplat divides by their number
             means2d, radii = gaussians.means[:, :2].clone(), gaussians.opacities.detach()
             inputs = (means2d, gaussians.quats_wxyz, gaussians.scales, gaussians.opacities, gaussians.colors)
@@ -69,7 +69,7 @@ class GsplatRenderer(SplattingRenderer[SplattingSettings]):
             sums = nothing + gaussians.means.new_zeros(camera.height, camera.width, widths)
             sums[..., :3] += constant(self.settings.background, sums)
             maps = split_channels(sums, parts)
-            return DrawnView(maps["rgb"], nothing.expand(camera.height, camera.width), maps, means2d, radii)
+            return {**maps, "alpha": nothing.expand(camera.height, camera.width)}, means2d, radii
         from gsplat import fully_fused_projection, isect_offset_encode, isect_tiles, rasterize_to_pixels
 
         # Subtracting the camera's centre before gsplat rotates keeps float32 accurate far from the world's origin.
@@ -93,7 +93,7 @@ class GsplatRenderer(SplattingRenderer[SplattingSettings]):
         image, alpha = rasterize_to_pixels(*splats, *size, TILE_SIZE, *tiles, backgrounds=background)
         maps = split_channels(image[0], parts)
         largest = torch.where(visible, radii[0].amax(-1), 0).to(means2d.dtype)
-        return DrawnView(maps["rgb"], alpha[0, ..., 0], maps, means2d, largest)
+        return {**maps, "alpha": alpha[0, ..., 0]}, means2d, largest
 
     def _parts(self, gaussians: Gaussians, camera: Camera, depths: Tensor, wants: Sequence[str]) -> dict[str, Tensor]:
         """Channels to composite by output; colour is the first. [N, C] each"""

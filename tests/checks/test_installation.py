@@ -9,7 +9,8 @@ import torch
 
 from coliags_plugin.checks import installation
 from coliags_plugin.checks.installation import check_installation
-from coliags_plugin.renderers import cpu_renderer, triton_renderer
+from coliags_plugin.renderers.cpu_renderer import CpuRenderer
+from coliags_plugin.renderers.triton_renderer import TritonRenderer
 from tests.commands import refused, run
 from tests.pretended_cuda import CUDA, PretendedCuda
 
@@ -41,14 +42,16 @@ def test_the_renderers_of_a_cpu_pass(small):
 @needs_triton
 def test_a_device_that_is_not_there(small, monkeypatch):
     monkeypatch.setattr(torch.version, "cuda", "12.8")
-    right = triton_renderer.render_gaussians
+    right = TritonRenderer.draw
     with PretendedCuda() as device:
         results = checked("cuda")
         # The opacities of a Gaussian are off by a thousandth in the kernel's table.
         monkeypatch.setattr(
-            triton_renderer,
-            "render_gaussians",
-            lambda gaussians, *args: right(replace(gaussians, opacities=gaussians.opacities * 0.999), *args),
+            TritonRenderer,
+            "draw",
+            lambda self, gaussians, *args: right(
+                self, replace(gaussians, opacities=gaussians.opacities * 0.999), *args
+            ),
         )
         wrong = checked("cuda")["renderer triton"]
     assert results["cuda"].detail.startswith("PyTorch for CUDA 12.8")
@@ -76,8 +79,8 @@ def test_without_a_device_it_says_what_it_would_do(monkeypatch):
     ],
 )
 def test_a_wrong_renderer_fails(small, monkeypatch, spoiled, told):
-    right = cpu_renderer.render_gaussians
-    monkeypatch.setattr(cpu_renderer, "render_gaussians", lambda *args: spoiled(right(*args)))
+    right = CpuRenderer.draw
+    monkeypatch.setattr(CpuRenderer, "draw", lambda *args: spoiled(right(*args)))
     result = checked("cpu")["renderer cpu"]
     assert result.status == "failed" and "`renderer=torch`" in result.detail
     assert all(f"{told} {primitive} by " in result.detail for primitive in ("gaussians3d", "surfels"))
@@ -87,7 +90,7 @@ def test_an_exception_is_a_failed_check(small, monkeypatch, capsys):
     def broken(*args):
         raise RuntimeError("\nCUDA error: no kernel image is available.\nCompile with TORCH_USE_CUDA_DSA")
 
-    monkeypatch.setattr(cpu_renderer, "render_gaussians", broken)
+    monkeypatch.setattr(CpuRenderer, "draw", broken)
     assert run("doctor", "--device", "cpu") == 1
     (line,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("BAD")]
     assert "RuntimeError: CUDA error: no kernel image is available. Until that" in line

@@ -15,9 +15,9 @@ from coliags_plugin.engine.checkpoints import read_checkpoint
 from coliags_plugin.engine.run_folder import RunFolder
 from coliags_plugin.engine.scoring import Scorer
 from coliags_plugin.engine.trainer import Trainer
-from coliags_plugin.renderers import torch_renderer
+from coliags_plugin.renderers.triton_renderer import TritonRenderer
 from tests.pretended_cuda import CUDA, MixedDevicesError, PretendedCuda
-from tests.renderers.test_torch_renderer import INPUTS, cast, scene
+from tests.renderers.test_torch_renderer import INPUTS, cast, render_gaussians, scene
 from tests.scenes import SMALL, wall_scene, write_wall
 
 #: What runs on the device in training, without renderers: rivals and modules beyond those of `coliags`.
@@ -102,20 +102,24 @@ def test_what_cuda_refuses_is_refused():
                 mixing()
 
 
+class Careless(TritonRenderer):
+    """The triton renderer without its check of devices."""
+
+    devices = frozenset({"cpu"})
+
+
 def test_kernels_are_given_tensors_of_the_device_alone():
     pytest.importorskip("triton")
-    from coliags_plugin.renderers.triton_renderer import render_gaussians
-
     here, camera = scene("random")
     here = cast(here, torch.float32)
-    expected = torch_renderer.render_gaussians(here, camera).rgb
+    expected = render_gaussians(here, camera).rgb
     with PretendedCuda():
         there = replace(here, **{name: getattr(here, name).to("cuda") for name in (*INPUTS, "source_index")})
-        drawn = render_gaussians(there, camera).rgb
+        drawn = render_gaussians(there, camera, renderer=TritonRenderer).rgb
         assert drawn.is_cuda
         torch.testing.assert_close(drawn.cpu(), expected, atol=1e-5, rtol=1e-5)
         with pytest.raises(MixedDevicesError, match=r"argument \w+ of kernel"):
-            render_gaussians(here, camera)
+            render_gaussians(here, camera, renderer=Careless)
 
 
 @pytest.mark.thorough

@@ -17,8 +17,8 @@ from coliags_plugin.core.tensors import point_normals, wall_normals
 from coliags_plugin.fields.explicit_gaussians import AttenuatedGaussians
 from coliags_plugin.fields.numba_kernels import spherical_harmonics as kernel
 from coliags_plugin.fields.spherical_harmonics import Y0, basis, colors
-from coliags_plugin.renderers.torch_renderer import render_gaussians
 from tests.fields.made import colored_wall, make_field
+from tests.renderers.test_torch_renderer import render_gaussians
 from tests.scenes import camera_at, wall_scene
 
 

@@ -18,8 +18,8 @@ from coliags_plugin.core.lamps import Lamp
 from coliags_plugin.core.scenes import PointCloud
 from coliags_plugin.fields import lit_gaussians
 from coliags_plugin.fields.lit_gaussians import _ROWS, GAMMA, PINK, THICKNESS, Cosines, DiffuseNetwork, reflection
-from coliags_plugin.renderers.torch_renderer import render_gaussians
 from tests.fields.made import colored_wall, make_field
+from tests.renderers.test_torch_renderer import render_gaussians
 from tests.scenes import camera_at, wall_scene
 
 SCHEDULE = Schedule(100, 100)

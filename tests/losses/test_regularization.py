@@ -17,12 +17,11 @@ from coliags_plugin.core.gaussians import rotation_matrices
 from coliags_plugin.engine.model import Model
 from coliags_plugin.losses.regularization import depth_normals
 from coliags_plugin.modules.exposure import FrameGain
-from coliags_plugin.renderers.torch_renderer import render_gaussians
 from tests.fields.made import make_field
 from tests.losses import terms
 from tests.losses.terms import make, make_output
 from tests.renderers.test_surfels import facing_along, make_surfels
-from tests.renderers.test_torch_renderer import rigid
+from tests.renderers.test_torch_renderer import render_gaussians, rigid
 from tests.scenes import plain_frame as make_frame
 from tests.scenes import wall_scene
 

@@ -18,39 +18,45 @@ from hypothesis import strategies as st
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.gaussians import rotation_matrices
 from coliags_plugin.core.render_output import OUTPUTS
-from coliags_plugin.renderers import cpu_renderer, torch_renderer, triton_renderer
-from coliags_plugin.renderers.torch_renderer import TorchRendererSettings
+from coliags_plugin.renderers.cpu_renderer import CpuRenderer
+from coliags_plugin.renderers.torch_renderer import TorchRenderer, TorchRendererSettings
+from coliags_plugin.renderers.triton_renderer import TritonRenderer
 from tests.renderers import test_surfels as surfels
 from tests.renderers import test_torch_renderer as solids
 from tests.renderers.test_surfels import as_surfels, make_surfels, outputs_of
-from tests.renderers.test_torch_renderer import INPUTS, cast, pinhole, random_gaussians, relative
+from tests.renderers.test_torch_renderer import INPUTS, cast, pinhole, random_gaussians, relative, render_gaussians
 
 PRIMITIVES = ("gaussians3d", "surfels")
 of_each = pytest.mark.parametrize("primitive", PRIMITIVES)
 needs_triton = pytest.mark.skipif(find_spec("triton") is None, reason="triton is not installed")
 
 
-class OnCuda:
+class Interpreted(TritonRenderer):
+    """The triton renderer in triton's interpreter."""
+
+    devices = frozenset({"cpu"})
+
+
+class OnCuda(TritonRenderer):
     """The triton renderer on a device, from and to tensors on the CPU."""
 
-    @staticmethod
-    def render_gaussians(gaussians, camera, wants=("rgb", "alpha"), settings=None):
+    def draw(self, gaussians, camera, wants):
         moved = {name: getattr(gaussians, name).cuda() for name in INPUTS}
         moved["features"] = {name: value.cuda() for name, value in gaussians.features.items()}
-        output = triton_renderer.render_gaussians(dataclasses.replace(gaussians, **moved), camera, wants, settings)
+        output = super().draw(dataclasses.replace(gaussians, **moved), camera, wants)
         maps = {name: value.cpu() for name, value in output.maps.items()}
         return dataclasses.replace(output, rgb=output.rgb.cpu(), alpha=output.alpha.cpu(), maps=maps)
 
 
 RENDERERS = (
-    pytest.param(cpu_renderer, id="cpu"),
-    pytest.param(triton_renderer, id="triton", marks=needs_triton),
+    pytest.param(CpuRenderer, id="cpu"),
+    pytest.param(Interpreted, id="triton", marks=needs_triton),
     pytest.param(OnCuda, id="triton on CUDA", marks=[needs_triton, pytest.mark.gpu]),
 )
 #: What takes long in triton's interpreter is thorough.
 SLOW_IN_INTERPRETER = (
     RENDERERS[0],
-    pytest.param(triton_renderer, id="triton", marks=[needs_triton, pytest.mark.thorough]),
+    pytest.param(Interpreted, id="triton", marks=[needs_triton, pytest.mark.thorough]),
     RENDERERS[2],
 )
 by_each = pytest.mark.parametrize("renderer", RENDERERS)
@@ -104,7 +110,7 @@ def on_a_cutoff(gaussians, camera):
         cuts = {name: getattr(kind(), name) * factor for name in ("alpha_min", "transmittance_min")}
         # A surfel is cut off at the near plane pixel by pixel.
         nearer = dataclasses.replace(camera, near_plane=camera.near_plane * (factor if are_surfels else 1))
-        alphas.append(torch_renderer.render_gaussians(gaussians, nearer, settings=kind(**cuts)).alpha)
+        alphas.append(render_gaussians(gaussians, nearer, settings=kind(**cuts)).alpha)
     differs = (alphas[1] - alphas[0]).abs() > 1e-9
     return differs | near_horizon(gaussians, camera) if are_surfels else differs
 
@@ -130,17 +136,18 @@ def near_horizon(gaussians, camera):
     return horizon
 
 
-def drawn(module, gaussians, camera, dtype, wants=None, ignored=None, of_means2d=0.0):
+def drawn(renderer, gaussians, camera, dtype, wants=None, ignored=None, of_means2d=0.0):
     """Output and gradients of one renderer under random cotangents, which are 0 at the pixels ignored."""
     wants = wants or outputs_of(gaussians)
     gaussians = cast(gaussians, dtype, grad=True)
     features = {name: value.to(dtype).clone().requires_grad_() for name, value in gaussians.features.items()}
     pose = camera.camera_to_world.to(dtype).clone().requires_grad_()
-    output = module.render_gaussians(
+    output = render_gaussians(
         dataclasses.replace(gaussians, features=features),
         dataclasses.replace(camera, camera_to_world=pose),
         wants,
         TorchRendererSettings(background=BACKGROUND),
+        renderer,
     )
     generator = torch.Generator().manual_seed(1)
     widths = {name: 3 if name in ("rgb", "normals") else 0 for name in OUTPUTS} | FEATURES
@@ -172,9 +179,9 @@ def test_agrees_with_the_definition_in_float64(renderer, primitive, name):
     ignored = on_a_cutoff(gaussians, camera)
     assert int(ignored.sum()) <= few(ignored.numel())
     ours, gradients = drawn(renderer, gaussians, camera, torch.float32, ignored=ignored)
-    true, true_gradients = drawn(torch_renderer, gaussians, camera, torch.float64, ignored=ignored)
+    true, true_gradients = drawn(TorchRenderer, gaussians, camera, torch.float64, ignored=ignored)
     of_outputs, of_gradients = MAGNIFIED.get((primitive, name), (1e-5, 2e-5))
-    if renderer is not cpu_renderer and primitive == "surfels":
+    if renderer is not CpuRenderer and primitive == "surfels":
         of_gradients *= 3  # sums of offsets in the image, which cancel more than those of offsets on the disc
     # Half of the light is one more cut-off, of the median alone.
     most = (10 if primitive == "surfels" else 1) * of_outputs
@@ -221,7 +228,7 @@ def test_any_outputs_and_features_and_the_centres_own_gradient_agree_with_the_de
     gaussians, wants = with_features(gaussians), wants or (*outputs_of(gaussians), "one")
     ignored = on_a_cutoff(gaussians, camera)
     ours, gradients = drawn(renderer, gaussians, camera, torch.float32, wants, ignored, of_means2d=0.01)
-    true, true_gradients = drawn(torch_renderer, gaussians, camera, torch.float64, wants, ignored, of_means2d=0.01)
+    true, true_gradients = drawn(TorchRenderer, gaussians, camera, torch.float64, wants, ignored, of_means2d=0.01)
     for key in {"rgb", "alpha", *wants} - {"depth_median"}:
         assert relative(ours[key][~ignored], true[key][~ignored]) <= 1e-5, key
     if "depth_median" in wants:  # half of the light is one more cut-off
@@ -236,25 +243,26 @@ def test_features_are_composited_like_colours_over_black(primitive):
     gaussians, camera = scene(primitive)
     features = {"copy": gaussians.colors, "white": torch.ones(len(gaussians), 1)}
     copied = dataclasses.replace(gaussians, features=features)
-    output = torch_renderer.render_gaussians(copied, camera, ("copy", "normals", "white"))
+    output = render_gaussians(copied, camera, ("copy", "normals", "white"))
     torch.testing.assert_close(output["copy"], output.rgb)
     torch.testing.assert_close(output["white"], output.alpha[..., None])
 
 
-@pytest.mark.parametrize("renderer", [cpu_renderer, torch_renderer])
+@pytest.mark.parametrize("renderer", [CpuRenderer, TorchRenderer])
 def test_features_that_are_none(renderer):
     gaussians, camera = scene("gaussians3d")
     nothing = cast(random_gaussians(0), torch.float32)
     nothing, wants = dataclasses.replace(nothing, features={"one": torch.zeros(0, 1)}), (*solids.OUTPUTS, "one")
-    assert not renderer.render_gaussians(nothing, camera, wants)["one"].any()
+    assert not render_gaussians(nothing, camera, wants, renderer=renderer)["one"].any()
     with pytest.raises(InputError, match=r"no renderer output 'onne'.*\n?.*'one'"):
-        renderer.render_gaussians(nothing, camera, ("onne",))
-    for spoiled, message in (
+        render_gaussians(nothing, camera, ("onne",), renderer=renderer)
+    for feature, message in (
         (torch.zeros(3, 2), "feature one of shape"),
         (torch.zeros(len(gaussians), 1).double(), "float64"),
     ):
         with pytest.raises(InputError, match=message):
-            cpu_renderer.render_gaussians(dataclasses.replace(gaussians, features={"one": spoiled}), camera, ("one",))
+            spoiled = dataclasses.replace(gaussians, features={"one": feature})
+            render_gaussians(spoiled, camera, ("one",), renderer=CpuRenderer)
 
 
 @of_each
@@ -266,7 +274,7 @@ def test_repeats_to_the_bit_with_any_number_of_threads(primitive):
     first = None
     for threads in (2, 2, 1, 1, 3, 3, 5):
         torch.set_num_threads(threads)
-        output, gradients = drawn(cpu_renderer, gaussians, camera, torch.float32, wants)
+        output, gradients = drawn(CpuRenderer, gaussians, camera, torch.float32, wants)
         first = first or (output, gradients)
         assert all(torch.equal(first[0][key], output[key]) for key in wants)
         assert all(torch.equal(first[1][key], gradients[key]) for key in gradients)
@@ -281,13 +289,15 @@ def test_bins_miss_no_pixel_that_a_surfel_reaches(renderer, seed, size, depth, l
     )
     gaussians = cast(as_surfels(gaussians), torch.float32)
     camera = pinhole(45, 38, 30.0, 27.0, dtype=torch.float32)
-    ours = renderer.render_gaussians(gaussians, camera, settings=TorchRendererSettings(surfel_filter=low_pass))
+    ours = render_gaussians(
+        gaussians, camera, settings=TorchRendererSettings(surfel_filter=low_pass), renderer=renderer
+    )
     kind = TorchRendererSettings
     exact, posed = cast(gaussians, torch.float64), camera.to(dtype=torch.float64)
-    true = torch_renderer.render_gaussians(exact, posed, settings=kind(surfel_filter=low_pass)).alpha
+    true = render_gaussians(exact, posed, settings=kind(surfel_filter=low_pass)).alpha
     # Pixels on the edge of what is drawn may fall to either side.
     brighter, dimmer = (
-        torch_renderer.render_gaussians(
+        render_gaussians(
             exact,
             dataclasses.replace(posed, near_plane=0.2 * factor),
             settings=kind(surfel_filter=low_pass, alpha_min=factor / 255),
@@ -307,7 +317,7 @@ def test_any_size(renderer, primitive, n, width, height, seed):
     gaussians, (_, camera) = of_primitive(primitive, random_gaussians(n, seed)), scene(primitive)
     camera = dataclasses.replace(camera, width=width, height=height, camera_to_world=torch.eye(4))
     ours, gradients = drawn(renderer, gaussians, camera, torch.float32)
-    true, _ = drawn(torch_renderer, cast(gaussians, torch.float32), camera, torch.float64)
+    true, _ = drawn(TorchRenderer, cast(gaussians, torch.float32), camera, torch.float64)
     assert ours.rgb.shape == (height, width, 3) and ours["depth_expected"].shape == (height, width)
     # A pixel on a cut-off may fall to either side in float32.
     off = (ours.rgb.detach().double() - true.rgb.detach()).abs().amax(-1) > 1e-4
@@ -325,7 +335,7 @@ def test_what_is_not_drawn_leaves_no_trace(renderer, near_plane):
     gaussians = cast(gaussians, torch.float32, grad=True)
     options = TorchRendererSettings(background=(0.1, 0.2, 0.3))
     camera = dataclasses.replace(pinhole(dtype=torch.float32), near_plane=near_plane)
-    output = renderer.render_gaussians(gaussians, camera, OUTPUTS, options)
+    output = render_gaussians(gaussians, camera, OUTPUTS, options, renderer=renderer)
     assert torch.equal(output.rgb, torch.tensor([0.1, 0.2, 0.3]).expand(7, 9, 3))
     assert not any(output[name].any() for name in OUTPUTS if name != "rgb")
     assert not output.splats.radii.any()
@@ -336,7 +346,7 @@ def test_what_is_not_drawn_leaves_no_trace(renderer, near_plane):
 @by_each
 def test_the_median_depth_has_a_gradient(renderer):
     gaussians = cast(make_surfels([[0, 0, 2.0], [0, 0, 3.0]], 1e2, 0.4), torch.float32, grad=True)
-    output = renderer.render_gaussians(gaussians, pinhole(dtype=torch.float32), OUTPUTS)
+    output = render_gaussians(gaussians, pinhole(dtype=torch.float32), OUTPUTS, renderer=renderer)
     assert torch.equal(output["depth_median"], torch.full((7, 9), 3.0))
     output["depth_median"][3, 4].backward()
     torch.testing.assert_close(gaussians.means.grad, torch.tensor([[0.0, 0, 0], [0, 0, 1.0]]), rtol=0, atol=1e-6)
@@ -355,7 +365,7 @@ def test_unusable_gaussians_are_named(primitive, name, value):
     gaussians, camera = scene(primitive)
     getattr(gaussians, name)[3] = value
     with pytest.raises(InputError, match=rf"{name}\[3\]"):
-        cpu_renderer.render_gaussians(gaussians, camera)
+        render_gaussians(gaussians, camera, renderer=CpuRenderer)
 
 
 @of_each
@@ -366,12 +376,12 @@ def test_shapes_dtypes_and_outputs_are_checked(primitive):
         # float64, a dimension too many, and rows that do not match
         for broken in (value.double(), value[..., None], torch.cat([value, value[:1]])):
             with pytest.raises(InputError):
-                cpu_renderer.render_gaussians(dataclasses.replace(gaussians, **{name: broken}), camera)
+                render_gaussians(dataclasses.replace(gaussians, **{name: broken}), camera, renderer=CpuRenderer)
     with pytest.raises(InputError, match="scales"):
-        cpu_renderer.render_gaussians(dataclasses.replace(gaussians, scales=gaussians.scales[:, :1]), camera)
+        render_gaussians(dataclasses.replace(gaussians, scales=gaussians.scales[:, :1]), camera, renderer=CpuRenderer)
     output, message = ("depth", "no renderer output") if primitive == "surfels" else ("distortion", "of 3D Gaussians")
     with pytest.raises(InputError, match=message):
-        cpu_renderer.render_gaussians(gaussians, camera, (output,))
+        render_gaussians(gaussians, camera, (output,), renderer=CpuRenderer)
 
 
 @pytest.mark.parametrize("device", ["meta", pytest.param("cuda", marks=pytest.mark.gpu)])
@@ -379,8 +389,8 @@ def test_shapes_dtypes_and_outputs_are_checked(primitive):
 def test_tensors_elsewhere_are_refused_by_name(name, device):
     gaussians, camera = scene("gaussians3d")
     elsewhere = dataclasses.replace(gaussians, **{name: getattr(gaussians, name).to(device)})
-    with pytest.raises(InputError, match=rf"^{name} on {device}.* for the cpu renderer\. Expected tensors on the cpu"):
-        cpu_renderer.render_gaussians(elsewhere, camera)
+    with pytest.raises(InputError, match=rf"^{name} on {device}.* for the cpu renderer\. Expected tensors on cpu"):
+        render_gaussians(elsewhere, camera, renderer=CpuRenderer)
 
 
 @of_each
@@ -395,7 +405,7 @@ def test_wild_numbers_never_crash(primitive, seed):
         hit = torch.rand(value.shape, generator=generator) < 0.02
         value[hit] = WILD[torch.randint(len(WILD), (int(hit.sum()),), generator=generator)]
     try:
-        output, _ = drawn(cpu_renderer, gaussians, camera, torch.float32)
+        output, _ = drawn(CpuRenderer, gaussians, camera, torch.float32)
     except InputError:
         return
     assert output.rgb.shape == (camera.height, camera.width, 3)
@@ -418,8 +428,7 @@ def test_extreme_sizes_and_views_stay_finite(renderer, seed, exponent):
 
 def test_triton_refuses_what_its_kernels_cannot_take():
     gaussians, camera = scene("gaussians3d")
-    renderer = triton_renderer.TritonRenderer(TorchRendererSettings())
-    with pytest.raises(InputError, match="Gaussians on cpu for the triton renderer"):
-        renderer.draw(gaussians, camera, ("rgb",))
-    with pytest.raises(InputError, match="Gaussians of dtype float64 for the triton renderer"):
-        triton_renderer.render_gaussians(cast(gaussians, torch.float64), camera)
+    with pytest.raises(InputError, match="means on cpu for the triton renderer"):
+        render_gaussians(gaussians, camera, renderer=TritonRenderer)
+    with pytest.raises(InputError, match="means of dtype float64 for the triton renderer"):
+        render_gaussians(cast(gaussians, torch.float64), camera, renderer=TritonRenderer)

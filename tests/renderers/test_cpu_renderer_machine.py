@@ -18,9 +18,9 @@ import torch
 from numba import types
 
 from coliags_plugin.core.numba_kernels import compilation
-from coliags_plugin.renderers import cpu_renderer
+from coliags_plugin.renderers.cpu_renderer import CpuRenderer
 from coliags_plugin.renderers.numba_kernels import layout, sweep_backward, sweep_forward
-from tests.renderers.test_torch_renderer import cast, scene
+from tests.renderers.test_torch_renderer import cast, render_gaussians, scene
 
 # --- registers --------------------------------------------------------------------------------------------------------
 
@@ -177,7 +177,7 @@ def view():
 def gradient(gaussians, camera):
     """Gradient of the means, by a graph of its own."""
     gaussians = cast(gaussians, grad=True)
-    output = cpu_renderer.render_gaussians(gaussians, camera, ("depth_accumulated",))
+    output = render_gaussians(gaussians, camera, ("depth_accumulated",), renderer=CpuRenderer)
     (output.rgb.sum() + output["depth_accumulated"].sum()).backward()
     return gaussians.means.grad
 
@@ -207,7 +207,7 @@ def test_views_may_wait_for_their_gradients_in_any_order():
     cameras = [camera, dataclasses.replace(camera, fx=2 * camera.fx)]
     alone = [gradient(gaussians, camera) for camera in cameras]
     gaussians = cast(gaussians, grad=True)
-    outputs = [cpu_renderer.render_gaussians(gaussians, camera, ("depth_accumulated",)) for camera in cameras]
+    outputs = [render_gaussians(gaussians, camera, ("depth_accumulated",), renderer=CpuRenderer) for camera in cameras]
     for output, expected in zip(outputs, alone, strict=True):
         gaussians.means.grad = None
         (output.rgb.sum() + output["depth_accumulated"].sum()).backward()

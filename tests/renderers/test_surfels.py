@@ -16,7 +16,7 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.render_output import OUTPUTS
 from coliags_plugin.engine.model import Model
 from coliags_plugin.renderers import compositing, torch_renderer
-from coliags_plugin.renderers.torch_renderer import TorchRenderer, TorchRendererSettings, render_gaussians
+from coliags_plugin.renderers.torch_renderer import TorchRenderer, TorchRendererSettings
 from coliags_plugin.renderers.volume_renderer import VolumeRenderer, VolumeRendererSettings
 from tests.renderers.naive import splat, splat_surfels
 from tests.renderers.test_torch_renderer import (
@@ -30,6 +30,7 @@ from tests.renderers.test_torch_renderer import (
     random_cotangents,
     random_gaussians,
     relative,
+    render_gaussians,
     rigid,
     with_gradients,
 )

@@ -18,7 +18,7 @@ from coliags_plugin.core.gaussians import Gaussians
 from coliags_plugin.core.render_output import OUTPUTS as ALL_OUTPUTS
 from coliags_plugin.core.render_output import SURFEL_OUTPUTS
 from coliags_plugin.renderers.splatting import choose_renderer
-from coliags_plugin.renderers.torch_renderer import TorchRenderer, TorchRendererSettings, render_gaussians
+from coliags_plugin.renderers.torch_renderer import TorchRenderer, TorchRendererSettings
 from tests.renderers.naive import extent
 
 INPUTS = ("means", "quats_wxyz", "scales", "opacities", "colors")
@@ -42,6 +42,11 @@ def pinhole(width=9, height=7, fx=20.0, fy=20.0, cx=None, cy=None, pose=None, dt
     pose = torch.eye(4, dtype=dtype) if pose is None else pose.to(dtype)
     cx, cy = (width / 2 if cx is None else cx), (height / 2 if cy is None else cy)
     return Camera(fx, fy, cx, cy, width, height, pose)
+
+
+def render_gaussians(gaussians, camera, wants=("rgb", "alpha"), settings=None, renderer=TorchRenderer):
+    """View of Gaussians by a renderer."""
+    return renderer(settings or renderer.Settings()).draw(gaussians, camera, wants)
 
 
 def rigid(seed):
