@@ -6,7 +6,7 @@ import logging
 import math
 import os
 import platform
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sized
 from contextlib import contextmanager, suppress
 from datetime import datetime
 from pathlib import Path
@@ -23,12 +23,13 @@ _Item = TypeVar("_Item")
 Progress = Callable[[str, int, int], None]
 
 
-def with_progress(items: Sequence[_Item], what: str, progress: Progress | None) -> Iterator[_Item]:
-    """The items; each is reported when the next one is asked for."""
+def with_progress(items: Iterable[_Item], what: str, progress: Progress | None, expected: int = 0) -> Iterator[_Item]:
+    """The items; each is reported when the next one is asked for. ``expected`` is about their number, if unknown."""
+    total = len(items) if isinstance(items, Sized) else expected
     for done, item in enumerate(items, start=1):
         yield item
         if progress is not None:
-            progress(what, done, len(items))
+            progress(what, done, max(done, total))
 
 
 log = logging.getLogger(__name__)

@@ -21,7 +21,7 @@ from coliags_plugin.core.settings import invalid_reported
 from coliags_plugin.datamanagers.colmap import ATLAS_FILE, AtlasRecord, read_atlas
 from coliags_plugin.geometry.poses import colmap, tum
 from coliags_plugin.geometry.poses.trajectory import Trajectory
-from coliags_plugin.pipeline.frames import IMAGES, FramesRecord
+from coliags_plugin.pipeline.frames import FramesRecord
 from coliags_plugin.pipeline.joins import ModelKey, SegmentJoin
 from coliags_plugin.pipeline.stages import MADE, RECORD_FILE, SHARED, Record, StageRecord
 from coliags_plugin.pipeline.survey import SURVEY_FILE, Segment, Survey, Video
@@ -102,7 +102,6 @@ class SegmentContents:
     span: Segment
     stages: Mapping[str, StageRecord]  # by their names within it
     submaps: Sequence[SubmapContents]  # the largest first
-    images: Path  # folder of the frames of use
     used: Mapping[int, str]  # names of the frames of use, by their number in the video
     lost: Mapping[int, str]  # why frames have no pose, by their numbers
 
@@ -231,8 +230,7 @@ def _read_segment(folder: Path, span: Segment, stages: Mapping[str, StageRecord]
         except (LookupError, ValueError) as error:
             text = f"{error}".encode(errors="backslashreplace").decode()  # a name may be any text
             raise InputError(f"{folder / 'poses' / ATLAS_FILE} does not fit the frames: {text}", MADE) from error
-    largest_first = [submaps[number] for number in sorted(submaps)]
-    return SegmentContents(span, stages, largest_first, folder / "frames" / IMAGES, used, lost)
+    return SegmentContents(span, stages, [submaps[number] for number in sorted(submaps)], used, lost)
 
 
 def _frame_numbers(atlas: AtlasRecord, numbers: Mapping[str, int], video: Video) -> list[int]:

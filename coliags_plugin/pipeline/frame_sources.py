@@ -18,7 +18,7 @@ from jaxtyping import Float64, UInt8
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import user_path
 from coliags_plugin.core.images import has_alpha, read_8_bit, write_image
-from coliags_plugin.core.jobs import Progress
+from coliags_plugin.core.jobs import Progress, with_progress
 from coliags_plugin.core.scene_files import FRAME_SUFFIXES
 from coliags_plugin.engine.data_formats import videos_in
 from coliags_plugin.geometry.lenses.vicalib import SUFFIX, find_calibration, read_calibration
@@ -235,17 +235,6 @@ def one_field(image: UInt8[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "H W 3"]:
     return whole
 
 
-def watched(
-    source: FrameSource, what: str, progress: Progress | None
-) -> Iterator[tuple[str, UInt8[np.ndarray, "H W 3"]]]:
-    """Names and images of a source; each is reported when the next one is asked for."""
-    expected = source.expected
-    for count, frame in enumerate(source, start=1):
-        yield frame
-        if progress is not None:
-            progress(what, count, max(count, expected))
-
-
 @contextmanager
 def image_files(source: Path, progress: Progress | None = None) -> Iterator[list[Path]]:
     """Image files of a folder, or of a video's frames, which are written to a temporary folder without loss.
@@ -261,7 +250,7 @@ def image_files(source: Path, progress: Progress | None = None) -> Iterator[list
     frames = chosen_frames(source, FrameSettings())
     with tempfile.TemporaryDirectory(prefix="coliags-frames-") as scratch:
         files = []
-        for name, image in watched(frames, "read frames", progress):
+        for name, image in with_progress(frames, "read frames", progress, frames.expected):
             files.append(Path(scratch) / f"{name}.png")
             write_image(files[-1], image)
         yield files

@@ -15,10 +15,10 @@ from pydantic import BaseModel, ConfigDict, Field
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_folder, write_json
 from coliags_plugin.core.images import write_image, write_mask
-from coliags_plugin.core.jobs import Progress
+from coliags_plugin.core.jobs import Progress, with_progress
 from coliags_plugin.core.settings import read_validated
 from coliags_plugin.datamanagers.reading.images import read_mask
-from coliags_plugin.pipeline.frame_sources import FrameSource, watched
+from coliags_plugin.pipeline.frame_sources import FrameSource
 from coliags_plugin.pipeline.settings import FEWEST, FrameSettings
 from coliags_plugin.pipeline.stages import MADE
 from coliags_plugin.pipeline.survey import Survey, corner_motion, reduced
@@ -116,7 +116,7 @@ def write_frames(
     blurred, sharpest = blurred_frames(chosen, sharpnesses, settings), set(chosen)
     frames, last = list[KeptFrame](), None
     with atomic_folder(folder, overwrite=True) as scratch:
-        for index, (name, image) in enumerate(watched(source, "write frames", progress)):
+        for index, (name, image) in enumerate(with_progress(source, "write frames", progress, source.expected)):
             if index not in sharpest:
                 continue
             gray = reduced(image)

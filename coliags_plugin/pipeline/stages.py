@@ -18,7 +18,7 @@ from coliags_plugin.core import __version__
 from coliags_plugin.core.errors import InputError, NotFiniteError, NothingDrawnError
 from coliags_plugin.core.files import write_json
 from coliags_plugin.core.jobs import locked
-from coliags_plugin.core.json_files import json_text, parse_json
+from coliags_plugin.core.json_files import read_json
 from coliags_plugin.core.settings import invalid_reported
 from coliags_plugin.core.text_files import without_places
 from coliags_plugin.reporting.numbers import duration
@@ -188,18 +188,16 @@ def wait_for_workers(folder: Path) -> None:
 
 def _read(file: Path) -> dict[str, StageRecord]:
     """The stages in a record; refused are damaged ones, and those of other versions of the package."""
-    try:
-        content = parse_json(json_text(file))
-        if isinstance(content, dict) and content.get("format") != FORMAT:
-            raise InputError(
-                f"{file} is of version {content.get('version', 'unknown')} of coliags_plugin",
-                f"format {FORMAT}, of version {__version__}",
-                "Choose another `output`, or go on with that version",
-            )
-        with invalid_reported(f"cannot read {file}: ", MADE, "Choose another `output`"):
-            return _RECORDED.validate_python(content["stages"])
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(f"cannot read {file}: {error}", MADE, "Choose another `output`") from error
+    other = "Choose another `output`"
+    content = read_json(file, MADE, other)
+    if isinstance(content, dict) and content.get("format") != FORMAT:
+        raise InputError(
+            f"{file} is of version {content.get('version', 'unknown')} of coliags_plugin",
+            f"format {FORMAT}, of version {__version__}",
+            f"{other}, or go on with that version",
+        )
+    with invalid_reported(f"cannot read {file}: ", MADE, other):
+        return _RECORDED.validate_python(content.get("stages") if isinstance(content, dict) else content)
 
 
 def run_stages(stages: Sequence[Stage], record: Record) -> None:

@@ -11,13 +11,14 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, UInt8
 from pydantic import BaseModel, ConfigDict, Field, model_validator
+from scipy.ndimage import binary_fill_holes, binary_propagation
 from typing_extensions import Self
 
 from coliags_plugin.core.arrays import dilated, read_arrays
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import write_arrays
-from coliags_plugin.core.jobs import Progress
-from coliags_plugin.pipeline.frame_sources import FrameSource, watched
+from coliags_plugin.core.jobs import Progress, with_progress
+from coliags_plugin.pipeline.frame_sources import FrameSource
 from coliags_plugin.pipeline.settings import FrameSettings
 from coliags_plugin.pipeline.stages import MADE
 from coliags_plugin.reconstruction.structure.point_tracks import sharpness
@@ -42,6 +43,8 @@ _RIM = 9
 _RETURN = 0.5
 #: Brightness (of 255) that a pixel outside of the lens's image never exceeds, and pixels by which that is widened.
 _DARK, _MARGIN = 16, 3
+#: Pixels that are connected: those that share an edge or a corner.
+_NEIGHBOURS = np.ones((3, 3), bool)
 #: Shares of the image between which a dark border is believed.
 _BORDER = (0.002, 0.7)
 #: A pixel that changes by less than this over the video, of 255, is still; the others change by at least twice as much
@@ -101,10 +104,7 @@ def lens_mask(brightest: UInt8[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"] | 
     False where a pixel is dark in every frame and connected to the image's edge. ``brightest`` is the largest value of
     each pixel in any channel of any frame.
     """
-    dark = (brightest <= _DARK).astype(np.uint8)
-    _, labels = cv2.connectedComponents(dark)
-    rim = np.unique(np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]]))
-    outside = np.isin(labels, rim[rim > 0]) & (dark > 0)
+    outside = ~binary_fill_holes(brightest > _DARK, _NEIGHBOURS)
     share = float(outside.mean())
     return ~dilated(outside, _MARGIN) if _BORDER[0] <= share <= _BORDER[1] else None
 
@@ -127,9 +127,8 @@ def overlays(
         channel = np.ascontiguousarray(mean[..., number])
         slopes = (cv2.Sobel(channel, cv2.CV_32F, *axis, scale=1 / 8) for axis in ((1, 0), (0, 1)))
         np.maximum(slope, np.hypot(*slopes), out=slope)
-    _, labels = cv2.connectedComponents(dilated(still, 1).astype(np.uint8))
-    marked = np.unique(labels[still & dilated(slope > _EDGE, 1)])
-    return dilated(np.isin(labels, marked[marked > 0]), _MARGIN)
+    with_edges = binary_propagation(still & dilated(slope > _EDGE, 1), _NEIGHBOURS, dilated(still, 1))
+    return dilated(with_edges, _MARGIN)
 
 
 def reduced(image: UInt8[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "h w"]:
@@ -222,7 +221,7 @@ def survey_video(source: FrameSource, progress: Progress | None = None) -> Surve
     """
     whole = FrameSurvey(source.path)
     followed, motions, last = list[float](), list[float](), None
-    for _, image in watched(source, "look at frames", progress):
+    for _, image in with_progress(source, "look at frames", progress, source.expected):
         whole.add(image)
         gray = reduced(image)
         moved, share = (np.inf, 0.0) if last is None else corner_motion(last, gray)

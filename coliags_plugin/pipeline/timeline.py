@@ -15,7 +15,7 @@ import numpy as np
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import read_rgb
 from coliags_plugin.pipeline.contents import Contents
-from coliags_plugin.pipeline.frames import THINNED
+from coliags_plugin.pipeline.frames import IMAGES, THINNED
 from coliags_plugin.reporting.html_page import COLORS
 from coliags_plugin.reporting.image_files import EncodedImage
 from coliags_plugin.reporting.model import Template
@@ -106,8 +106,9 @@ def picture_near(contents: Contents, first: int, last: int) -> EncodedImage | No
     for segment in contents.segments:
         near = min(segment.used, key=lambda frame: abs(frame - middle), default=None)
         if near is not None and first <= near <= last:
+            file = contents.folder / segment.span.name / "frames" / IMAGES / segment.used[near]
             with suppress(InputError, OSError, ValueError):
-                return EncodedImage.jpeg(read_rgb(segment.images / segment.used[near]), 80, _WIDTH)
+                return EncodedImage.jpeg(read_rgb(file), 80, _WIDTH)
             return None
     return None
 

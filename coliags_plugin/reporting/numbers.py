@@ -99,12 +99,11 @@ def ranks_of(keys: Sequence[float | None], direction: Direction | None) -> list[
     None where a value is unavailable, and everywhere with fewer than two values or without a direction. Give numbers as
     printed, so that what looks alike shares a rank.
     """
+    numbers = [key for key in keys if key is not None]
+    if direction is None or len(numbers) < 2:
+        return [None] * len(keys)
     sign = -1.0 if direction == "higher" else 1.0
-    signed = [None if key is None else sign * key for key in keys]
-    ranked = [key for key in signed if key is not None]
-    if direction is None or len(ranked) < 2:
-        return [None] * len(signed)
-    return [None if key is None else 1 + sum(other < key for other in ranked) for key in signed]
+    return [None if key is None else 1 + sum(sign * other < sign * key for other in numbers) for key in keys]
 
 
 def sentence(text: str) -> str:
