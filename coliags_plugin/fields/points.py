@@ -89,6 +89,6 @@ class _UniqueRows(torch.autograd.Function):
         return table.index_select(0, index)
 
     @staticmethod
-    def backward(ctx: Any, given: Tensor) -> tuple[Tensor, None]:
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
         (index,) = ctx.saved_tensors
-        return given.new_zeros(ctx.shape).index_copy_(0, index, given), None
+        return gradient.new_zeros(ctx.shape).index_copy_(0, index, gradient), None

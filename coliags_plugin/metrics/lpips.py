@@ -375,7 +375,7 @@ def _download(missing: Sequence[tuple[str, int]], target: Path) -> list[Path]:
     # Some content networks refuse a library's own name.
     fetch = pooch.HTTPDownloader(timeout=_TIMEOUT, headers={"User-Agent": f"coliags_plugin/{__version__}"})
     for number, file in enumerate(files):
-        urls = ", ".join(left.url for left in files[number:])
+        urls = ", ".join(later.url for later in files[number:])
         otherwise = f"On a machine with a connection download {urls}, and pass `from_folder=FOLDER` with them here"
         _log.info("download %s", file.url)
         with atomic_path(target / file.path) as path:

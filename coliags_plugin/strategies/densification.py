@@ -258,11 +258,11 @@ class AnchorGrowth(Strategy[AnchorGrowthSettings]):
         first_count = len(field.anchors)
         for level in range(options.levels):
             cell = float(field.spacing) / 4**level
-            left = most_births - (len(field.anchors) - first_count)
-            if left == 0 or cell < options.finest_cell * float(field.voxel_size):
+            births = most_births - (len(field.anchors) - first_count)
+            if births == 0 or cell < options.finest_cell * float(field.voxel_size):
                 break
             slots = (ready & (gradient >= options.gradient_threshold * 2.0**level)).nonzero().squeeze(1)
-            chosen = slots[one_per_free_cell(field.anchors, positions[slots], gradient[slots], cell, left)]
+            chosen = slots[one_per_free_cell(field.anchors, positions[slots], gradient[slots], cell, births)]
             if len(chosen):
                 self._add(field, rows, positions[chosen], chosen // children, cell)
         self.gradient_sum[ready] = 0.0

@@ -77,7 +77,7 @@ def attenuate(counters, colors, positions, normals, lamp, exponents, result):
 
 
 @kernel
-def attenuate_backward(counters, colors, positions, normals, lamp, exponents, given, of_colors, sums):
+def attenuate_backward(counters, colors, positions, normals, lamp, exponents, gradients, of_colors, sums):
     """Write the derivatives of :func:`attenuate` with respect to colours, and the sums of each slab. [SLABS, 16]"""
     count = len(colors) // 3
     three = (0, 0, 0)
@@ -88,7 +88,7 @@ def attenuate_backward(counters, colors, positions, normals, lamp, exponents, gi
             at = min(first, count - vec.WIDTH)
             logs, ray, inverse_square, axis, depth, normal, facing, counted = _seen(at, positions, normals, lamp)
             factors = _factors(logs, exponents)
-            of_result = vec.load_columns(given, 3 * at, three)
+            of_result = vec.load_columns(gradients, 3 * at, three)
             of_color = vec.mul(of_result, factors)
             vec.store_columns(of_colors, 3 * at, of_color)
             # With respect to the logarithms of the channels' factors; 0 in lanes that the vector before had.
@@ -126,13 +126,13 @@ def _seen(at, positions, normals, lamp):
         incidence = vec.div(vec.larger(facing, vec.neg(facing)), distance)
     else:
         normal, facing, incidence = vec.repeat(0.0, (0, 0, 0)), vec.splat(1.0), vec.splat(1.0)
-    seen = (ratio, cosine, incidence)
+    arguments = (ratio, cosine, incidence)
     least = vec.broadcast_all(lamp, 6, (0, 0, 0))
-    logs = vec.log2(vec.larger(seen, least))
+    logs = vec.log2(vec.larger(arguments, least))
     counted = (
-        vec.select(vec.at_least(seen[0], least[0]), 1.0, 0.0),
-        vec.select(vec.at_least(seen[1], least[1]), 1.0, 0.0),
-        vec.select(vec.at_least(seen[2], least[2]), 1.0, 0.0),
+        vec.select(vec.at_least(arguments[0], least[0]), 1.0, 0.0),
+        vec.select(vec.at_least(arguments[1], least[1]), 1.0, 0.0),
+        vec.select(vec.at_least(arguments[2], least[2]), 1.0, 0.0),
     )
     return logs, ray, vec.div(1.0, square), axis, depth, normal, facing, counted
 

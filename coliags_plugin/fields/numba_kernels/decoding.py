@@ -53,7 +53,7 @@ class Inputs(NamedTuple):
     of ``octaves``, plus as many right angles as its number in ``quadrants``.
     """
 
-    given: int  # R
+    plain: int  # R
     values: Array  # [V, R]
     octaves: Array  # [D, columns], 0 in the first R columns
     quadrants: Array  # [columns]
@@ -369,7 +369,7 @@ def _networks_in(table, widths, geometry_columns, appearance_columns):
 def _embed(table, inputs, first, rows):
     """Write the embedded inputs of a tile."""
     columns = len(inputs.quadrants)
-    count, plain = len(inputs.octaves) // columns, inputs.given
+    count, plain = len(inputs.octaves) // columns, inputs.plain
     for row in range(rows):
         at = (first + row) * plain
         for column in range(0, columns, vec.WIDTH):

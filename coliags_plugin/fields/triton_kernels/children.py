@@ -50,12 +50,12 @@ def networks_of(children: int, features: int, geometry: HeadNetworks, appearance
     networks: list[Network] = []
     start = 0
     for head in (geometry, appearance):
-        given = head.inputs.shape[1]
-        columns = features + given + 2 * head.embedded * head.frequencies
+        plain = head.inputs.shape[1]
+        columns = features + plain + 2 * head.embedded * head.frequencies
         for mlp in head.mlps:
             units, outputs = (len(mlp.get_parameter(name)) for name in ("0.bias", "2.bias"))
             each = outputs // children
-            networks.append(Network(start, units, each, children, features, given, head.embedded, columns))
+            networks.append(Network(start, units, each, children, features, plain, head.embedded, columns))
             start = networks[-1].end
     return tuple(networks)
 
