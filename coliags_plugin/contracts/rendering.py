@@ -10,7 +10,7 @@ from typing import Any, ClassVar, Generic
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
-from typing_extensions import Self, TypeVar
+from typing_extensions import TypeVar
 
 from coliags_plugin.contracts.fields import Field
 from coliags_plugin.core.cameras import Camera
@@ -114,11 +114,20 @@ class Renderer(ABC, Configurable[SettingsT], Generic[SettingsT, RenderedT]):
 
 
 class ViewModule(nn.Module, ABC, Configurable[SettingsT]):
-    """Per-view module: adjusts the camera before and the output after rendering; may learn parameters per frame."""
+    """Per-view module: adjusts the camera before and the output after rendering; may learn parameters per frame.
+
+    Args:
+        settings: Its options.
+        scene: Whose training frames it is for; the state of a checkpoint can be loaded into a new module.
+    """
 
     #: Whether :meth:`shade` depends on where in the image a pixel lies: ``output`` may be some pixels of a view, as an
     #: image of P rows and one column, unless this refuses samplers of pixels.
     whole_image: ClassVar[bool] = False
+
+    def __init__(self, settings: SettingsT, scene: Scene) -> None:
+        super().__init__()
+        self.settings = settings
 
     @property
     def wants(self) -> frozenset[str]:
@@ -129,17 +138,6 @@ class ViewModule(nn.Module, ABC, Configurable[SettingsT]):
     @abstractmethod
     def untrained_views(self) -> str:
         """Sentence for log and results on how views other than training frames are treated."""
-
-    @classmethod
-    def from_scene(cls, scene: Scene, settings: SettingsT, generator: torch.Generator) -> Self:
-        """A new module for the scene's training frames, into which a checkpoint's state can be loaded.
-
-        Default: the class called with settings and scene, without random numbers.
-
-        Raises:
-            InputError: The settings name frames that the scene does not have.
-        """
-        return cls(settings, scene)
 
     def prepare(self, scene: Scene) -> None:
         """Adapt the initial parameters to the scene, before training; not called when a run is loaded."""

@@ -172,7 +172,7 @@ def restore_model(
     """The model of a checkpoint, which trained on a scene at a scale; view modules have parameters of its frames."""
     with _fitting(f"the checkpoint does not fit field '{config.field.name}'"):
         field = config.field.target.from_state(checkpoint.part("field"), config.field.settings)
-    modules = make_view_modules(config, scene.scaled(scale), torch.Generator())
+    modules = make_view_modules(config, scene.scaled(scale))
     for name, module in modules.items():
         with _fitting(f"the checkpoint's module '{name}' does not fit"):
             module.load_state_dict(checkpoint.part(f"modules/{name}"))

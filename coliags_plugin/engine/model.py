@@ -153,9 +153,9 @@ class Model(nn.Module):
                 )
 
 
-def make_view_modules(config: MethodConfig, scene: Scene, generator: torch.Generator) -> dict[str, ViewModule]:
+def make_view_modules(config: MethodConfig, scene: Scene) -> dict[str, ViewModule]:
     """Fresh view modules of a method for a scene."""
-    return {name: node.target.from_scene(scene, node.settings, generator) for name, node in config.modules.items()}
+    return {name: node.target(node.settings, scene) for name, node in config.modules.items()}
 
 
 def check_components(

@@ -90,7 +90,7 @@ class Trainer:
         check_components(config, self.chosen, scene, self.losses, self.schedule)
         if field is None:
             field = config.field.target.from_scene(scene, config.field.settings, self.generators["initialisation"])
-        modules = make_view_modules(config, scene, self.generators["initialisation"])
+        modules = make_view_modules(config, scene)
         for module in modules.values():
             module.prepare(scene)
         self.model = Model(field, self.chosen.renderer, modules, config.near_plane)

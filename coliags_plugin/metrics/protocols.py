@@ -11,12 +11,12 @@ from dataclasses import replace
 from typing import Any, ClassVar
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from coliags_plugin.contracts import Comparison, Protocol
 from coliags_plugin.core.render_output import RenderOutput
-from coliags_plugin.core.scenes import Frame, SparseDepth
+from coliags_plugin.core.scenes import Frame
 from coliags_plugin.core.tensors import interpolated
 
 MetricTable = Mapping[str, tuple[str, Mapping[str, Any]]]
@@ -63,9 +63,11 @@ class PaperProtocol(Protocol):
         """Pair the rendered image, clamped to [0, 1], and the unchanged rendered depth with the frame."""
         depth = output[self.depth].detach()
         image = Comparison(rgb=output.rgb.detach().clamp(0.0, 1.0), true_rgb=frame.rgb, valid=frame.valid)
-        if frame.sparse_depth is not None:
-            rendered, true_depth = _at_points(depth, output.alpha.detach(), frame.valid, frame.sparse_depth)
-            image = replace(image, point_depth=rendered, true_point_depth=true_depth)
+        if (points := frame.sparse_depth) is not None:
+            drawn = (output.alpha.detach() > 0) & torch.isfinite(depth) & frame.valid
+            sampled, usable = interpolated(depth, drawn, points.pixels)
+            usable = usable & (points.depth > 0)
+            image = replace(image, point_depth=sampled[usable], true_point_depth=points.depth[usable])
         if (truth := frame.true_depth) is None:
             return replace(image, estimated=frame.depth_confidence is not None)
         return replace(image, depth=depth, true_depth=truth, depth_valid=torch.isfinite(truth) & frame.valid)
@@ -137,15 +139,6 @@ class AuthorsCodeProtocol(Protocol):
             true_depth=through_16_bit(true_depth, self.true_full_scale),
             depth_valid=everywhere,
         )
-
-
-def _at_points(
-    depth: Float[Tensor, "H W"], alpha: Float[Tensor, "H W"], valid: Bool[Tensor, "H W"], points: SparseDepth
-) -> tuple[Float[Tensor, "K"], Float[Tensor, "K"]]:
-    """Rendered and known depth at the points where all interpolated pixels are drawn and valid."""
-    sampled, usable = interpolated(depth, (alpha > 0) & torch.isfinite(depth) & valid, points.pixels)
-    usable = usable & (points.depth > 0)
-    return sampled[usable], points.depth[usable]
 
 
 _LEVELS = 65535

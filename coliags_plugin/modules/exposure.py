@@ -165,8 +165,7 @@ class FrameGain(ViewModule[FrameGainSettings]):
     rate: Tensor
 
     def __init__(self, settings: FrameGainSettings, scene: Scene) -> None:
-        super().__init__()
-        self.settings = settings
+        super().__init__(settings, scene)
         self.frames = FrameRows(scene)
         self.metering = Metering(scene, self.frames) if settings.untrained == "metered" else None
         self.log_gain = nn.Parameter(torch.zeros(len(self.frames), settings.channels))
@@ -268,8 +267,7 @@ class CameraResponse(ViewModule[ResponseSettings]):
     """
 
     def __init__(self, settings: ResponseSettings, scene: Scene) -> None:
-        super().__init__()
-        self.settings = settings
+        super().__init__(settings, scene)
         self.log_slope = nn.Parameter(torch.zeros(settings.segments))
 
     @property

@@ -38,8 +38,7 @@ class PoseCorrection(ViewModule[Settings]):
     """
 
     def __init__(self, settings: Settings, scene: Scene) -> None:
-        super().__init__()
-        self.settings = settings
+        super().__init__(settings, scene)
         self.frames = FrameRows(scene)
         self._pivot_depths = [_median_depth(frame.camera, scene) for frame in scene.train]
         self.rotation = nn.Parameter(torch.zeros(len(self.frames), 3))
@@ -105,8 +104,7 @@ class ImageWarp(ViewModule[ImageWarpSettings]):
     whole_image: ClassVar[bool] = True
 
     def __init__(self, settings: ImageWarpSettings, scene: Scene) -> None:
-        super().__init__()
-        self.settings = settings
+        super().__init__(settings, scene)
         self.frames = FrameRows(scene)
         nodes = settings.cells + 1
         self.displacement = nn.Parameter(torch.zeros(len(self.frames), 2, nodes, nodes))

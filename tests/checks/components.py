@@ -266,10 +266,6 @@ class CrashesForFreeCameras(ViewModule):
     Settings = Settings
     untrained_views = "as all"
 
-    @classmethod
-    def from_scene(cls, scene, settings, generator):
-        return cls()
-
     def parameter_groups(self):
         return {}
 

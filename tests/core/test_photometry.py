@@ -80,7 +80,7 @@ def test_masked_pixels_have_no_influence_to_the_bit():
 
 def test_the_module_starts_with_them_where_there_is_depth():
     settings = FrameGain.Settings(channels=3, initial="points")
-    module = FrameGain.from_scene(gained(GAINS), settings, torch.Generator())
+    module = FrameGain(settings, gained(GAINS))
     assert module.log_gains().exp().tolist() == [[1.0] * 3] * 7
     module.prepare(gained(GAINS))
     expected = (GAINS.log() - GAINS.log().mean()).exp()
@@ -93,7 +93,7 @@ def test_the_module_starts_with_them_where_there_is_depth():
     # The sum of three logarithms, relative to their mean over seven frames: both factors are a tenth.
     moved = (module.log_gains().exp().detach().log() - before).abs().max()
     assert moved.item() == pytest.approx(0.1 * 0.1 * 6 / 7, rel=1e-3)
-    without = FrameGain.from_scene(gained(GAINS, depth=False), settings, torch.Generator())
+    without = FrameGain(settings, gained(GAINS, depth=False))
     without.prepare(gained(GAINS, depth=False))
     assert without.log_gains().exp().tolist() == [[1.0] * 3] * 7
     few = replace(wall_scene(), train=wall_scene().train[:2])

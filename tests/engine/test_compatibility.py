@@ -184,7 +184,7 @@ class Shift(ViewModule):
     untrained_views = "all views alike"
 
     def __init__(self, step, factor, wants=()):
-        super().__init__()
+        super().__init__(None, None)
         self.step, self.factor, self.asked = step, factor, []
         self.weight = nn.Parameter(torch.ones(()))
         self._wants = frozenset(wants)
@@ -192,10 +192,6 @@ class Shift(ViewModule):
     @property
     def wants(self):
         return self._wants
-
-    @classmethod
-    def from_scene(cls, scene, settings, generator):
-        raise NotImplementedError
 
     def parameter_groups(self):
         return {"weight": [self.weight]}

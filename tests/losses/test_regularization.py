@@ -145,7 +145,7 @@ def test_opacity_is_the_mean_transparency_of_valid_pixels_and_distortion_the_mea
 
 
 def of_gains(values, frames=9, **options):
-    module = FrameGain.from_scene(wall_scene(frames), FrameGain.Settings(**options), torch.Generator())
+    module = FrameGain(FrameGain.Settings(**options), wall_scene(frames))
     with torch.no_grad():
         module.log_gain.copy_(values)
     model = SimpleNamespace(view_modules={"exposure": module}, field=None)
@@ -172,7 +172,7 @@ def test_steady_changes_cost_nothing_and_others_their_squared_curvature():
 
 @pytest.mark.parametrize(("modules", "message"), [((), "a module 'gain'"), (("exposure",), "module 'exposur'")])
 def test_other_methods_are_refused(modules, message):
-    gains = FrameGain.from_scene(wall_scene(), FrameGain.Settings(), torch.Generator())
+    gains = FrameGain(FrameGain.Settings(), wall_scene())
     with pytest.raises(InputError, match=message):
         make("smooth-gain", module="exposur").loss.check(
             SimpleNamespace(view_modules=dict.fromkeys(modules, gains), field=None)

@@ -54,7 +54,7 @@ def model():
     """A model with everything that losses read of one."""
     scene = wall_scene()
     field = make_field("gaussians", scene, normal_neighbours=10)
-    return Model(field, None, {"exposure": FrameGain.from_scene(scene, FrameGain.Settings(), torch.Generator())})
+    return Model(field, None, {"exposure": FrameGain(FrameGain.Settings(), scene)})
 
 
 @pytest.fixture

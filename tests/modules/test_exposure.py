@@ -24,7 +24,7 @@ from tests.scenes import wall_scene
 
 def make(logs=None, scene=None, **options):
     """The module of a scene, by default the wall's frames 1 to 7, with these logarithms."""
-    module = FrameGain.from_scene(scene or wall_scene(), FrameGainSettings(**options), torch.Generator())
+    module = FrameGain(FrameGainSettings(**options), scene or wall_scene())
     if logs is not None:
         with torch.no_grad():
             module.log_gain.copy_(torch.as_tensor(logs).reshape(module.log_gain.shape))
@@ -221,7 +221,7 @@ def test_views_are_interpolated_in_short_videos_and_until_all_training_frames_we
 
 
 def make_response(**options):
-    return CameraResponse.from_scene(wall_scene(), ResponseSettings(**options), torch.Generator())
+    return CameraResponse(ResponseSettings(**options), wall_scene())
 
 
 def test_it_begins_as_the_identity_for_every_view_and_colours_that_are_not_finite_stay_so():

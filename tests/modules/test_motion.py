@@ -59,7 +59,7 @@ def test_rotation_of_vector_is_scipys_and_alike_on_every_device():
 
 def make(frames=9):
     scene = wall_scene(frames)
-    return scene, PoseCorrection.from_scene(scene, PoseCorrection.Settings(), torch.Generator())
+    return scene, PoseCorrection(PoseCorrection.Settings(), scene)
 
 
 def test_corrections_turn_about_what_is_in_view():
@@ -183,7 +183,7 @@ WIDTH, HEIGHT = 40, 30
 
 def make_warp(frames=9, **options):
     scene = wall_scene(frames)
-    return scene, ImageWarp.from_scene(scene, ImageWarpSettings(**options), torch.Generator())
+    return scene, ImageWarp(ImageWarpSettings(**options), scene)
 
 
 def picture(seed=0):

@@ -16,14 +16,9 @@ class Vignette(ViewModule):
     whole_image = True  # shade asks where a pixel lies
     untrained_views = "all views have the same vignette"
 
-    def __init__(self):
-        super().__init__()
-        self.falloff = nn.Parameter(torch.zeros(()))
-
-    @classmethod
-    def from_scene(cls, scene, settings, generator):
-        """No vignette yet."""
-        return cls()
+    def __init__(self, settings, scene):
+        super().__init__(settings, scene)
+        self.falloff = nn.Parameter(torch.zeros(()))  # no vignette yet
 
     def parameter_groups(self):
         """One number."""
