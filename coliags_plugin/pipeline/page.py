@@ -233,8 +233,7 @@ def _pictures(contents: Contents) -> Iterator[Block]:
 
 def _views(contents: Contents) -> list[Section]:
     """Section of held-out views beside their renderings by sub-map; of many sub-maps, the best and the worst."""
-    from coliags_plugin.comparison.report.sources import read_study
-    from coliags_plugin.comparison.report.study import Study
+    from coliags_plugin.comparison.report.study import Study, read_study
     from coliags_plugin.comparison.report.views import view_section
 
     half, by_psnr = _SUBMAPS // 2, [submap for submap in contents.submaps if "psnr" in submap.figures]

@@ -13,7 +13,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from coliags_plugin.comparison.report.report import report_page
-from coliags_plugin.comparison.report.sources import read_study
+from coliags_plugin.comparison.report.study import read_study
 from coliags_plugin.config.options import ReportOptions
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.reporting.html_page import columns_of, html_blocks, html_text, write_html

@@ -20,8 +20,7 @@ from coliags_plugin.comparison.report.metric_tables import (
     statistics_text,
     training_device,
 )
-from coliags_plugin.comparison.report.sources import cautions, read_study
-from coliags_plugin.comparison.report.study import MissingResult, Study, StudyRun, grouped
+from coliags_plugin.comparison.report.study import MissingResult, Study, StudyRun, cautions, grouped, read_study
 from coliags_plugin.comparison.report.views import view_section
 from coliags_plugin.config.options import ReportOptions
 from coliags_plugin.core.errors import check_name
@@ -105,6 +104,7 @@ def report_page(study: Study, options: ReportOptions, screen: bool = False, scen
 
 def _facts(study: Study) -> list[Fact]:
     scenes, results = study.scenes, [run.result for run in study.runs]
+    protocol = results[0].protocol  # of all
     sizes = dict.fromkeys(result.scene.size for result in results)
     versions = dict.fromkeys(str(result.software.get("package_version") or "") for result in results)
     seeds = sorted({result.seed for result in results})
@@ -117,10 +117,10 @@ def _facts(study: Study) -> list[Fact]:
         "Split": ", ".join(filter(None, splits)),
         "Held-out frames": "; ".join(f"{count} {title}" for title, count in frames.items()),
         "Image size": ", ".join(f"{width} {_TIMES} {height} px" for width, height in sizes),
-        "Protocol": f"{study.protocol.name}, version {study.protocol.version}",
+        "Protocol": f"{protocol.name}, version {protocol.version}",
         "Evaluated with": ", ".join(f"coliags_plugin {version}" for version in versions if version),
     }
-    description = Fact("How the metrics are computed", study.protocol.description, wide=True)
+    description = Fact("How the metrics are computed", protocol.description, wide=True)
     return [*(Fact(name, value) for name, value in facts.items()), description]
 
 

