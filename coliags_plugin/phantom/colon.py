@@ -236,10 +236,16 @@ class ColonSurface:
 
 def build_surface(anatomy: Anatomy, settings: PhantomSettings) -> ColonSurface:
     """Mesh the wall, with fine displacement noise, at ``settings.mesh_spacing``."""
-    arc, wall_length = _even_rows(anatomy, settings.mesh_spacing)
+    # Rows that are evenly spaced along the wall.
+    fine = np.linspace(0.0, LENGTH, 4 * round(LENGTH) + 1)
+    step = fine[1] - fine[0]
+    slope = np.diff(anatomy.radius(fine, np.arange(96) * (2.0 * np.pi / 96)), axis=0) / step
+    walked = np.concatenate([[0.0], np.cumsum(np.sqrt(1.0 + (slope**2).mean(axis=1)) * step)])
+    rows = max(round(walked[-1] / settings.mesh_spacing), 24) + 1
+    arc = np.interp(np.linspace(0.0, walked[-1], rows), walked, fine)
     columns = max(round(2.0 * np.pi * 0.95 * RADIUS / settings.mesh_spacing), 24)
     clock = np.arange(columns) * (2.0 * np.pi / columns)
-    row_length = wall_length / (len(arc) - 1)
+    row_length = float(walked[-1]) / (len(arc) - 1)
     radius = anatomy.radius(arc, clock)
     centres, frames = anatomy.centre_line.at(arc)
     around = np.cos(clock)[None, :, None] * frames[:, None, :, 0] + np.sin(clock)[None, :, None] * frames[:, None, :, 1]
@@ -276,18 +282,6 @@ def surface_of(
         columns=grid.shape[1],
         row_length=row_length,
     )
-
-
-def _even_rows(anatomy: Anatomy, spacing: float) -> tuple[Float[np.ndarray, "R"], float]:
-    """Arc lengths of rows that are evenly spaced along the wall, and the wall's whole length, mm."""
-    fine = np.linspace(0.0, LENGTH, 4 * round(LENGTH) + 1)
-    step = fine[1] - fine[0]
-    radius = anatomy.radius(fine, np.arange(96) * (2.0 * np.pi / 96))
-    slope = np.diff(radius, axis=0) / step
-    stretch = np.sqrt(1.0 + (slope**2).mean(axis=1))
-    walked = np.concatenate([[0.0], np.cumsum(stretch * step)])
-    rows = max(round(walked[-1] / spacing), 24) + 1
-    return np.interp(np.linspace(0.0, walked[-1], rows), walked, fine), float(walked[-1])
 
 
 def grid_triangles(rows: int, columns: int, corners: str = "abc dcb", wraps: bool = True) -> Int[np.ndarray, "F 3"]:

@@ -282,13 +282,11 @@ _CONTACT_TIMES, _CONTACT_TURN = (0.6, 0.35, 0.6), 65.0
 #: Distance of the lens from the wall, mm: in a contact, and the smallest otherwise, of a wall at rest.
 _TOUCH, _CLEAR_OF_WALL = 1.2, 2.5
 
-Clearance = Callable[[Float[np.ndarray, "N 3"]], Float[np.ndarray, "N"]]
-
 
 def examining_path(
-    centre_line: CentreLine, settings: PhantomSettings, clearance: Clearance, touch: Callable[[int], Clearance]
+    centre_line: CentreLine, settings: PhantomSettings, tracer: Tracer, motion: WallMotion | None
 ) -> Float[np.ndarray, "T 4 4"]:
-    """Camera-to-world pose of every frame, OpenCV axes, mm; ``touch`` measures clearance in the wall of a frame."""
+    """Camera-to-world pose of every frame, OpenCV axes, mm; contacts are with the wall as it is then."""
     generator = stream(settings.seed, Purpose.TRAJECTORY)
     seconds, share = settings.frames / settings.frame_rate, np.linspace(0.0, 1.0, settings.frames)
     slow = np.stack([draw_sway(generator, _SLOW * seconds)(share) for _ in range(3)], axis=1)
@@ -296,7 +294,7 @@ def examining_path(
     arc = SHALLOW_END + _BACK + settings.path_length * (1.0 - share) + _BACK * slow[:, 0]
     points, frames = centre_line.at(arc)
     sideways = np.einsum("tck,tk->tc", frames[:, :, :2], _SIDEWAYS / np.sqrt(2.0) * slow[:, 1:])
-    sideways *= _permitted(points, sideways, clearance, settings)[:, None]
+    sideways *= _permitted(points, sideways, tracer, settings)[:, None]
     poses = looking(points + sideways, centre_line.at(arc + _LOOK_AHEAD)[0], frames)
     turns = np.radians(_TURN) * quick
     for pose, (yaw, pitch, roll) in zip(poses, turns, strict=True):
@@ -319,19 +317,19 @@ def examining_path(
         for pose, amount in zip(poses, swing, strict=True):
             pose[:3, :3] = pose[:3, :3] @ rotation_about(square_to(clock), amount * np.radians(angle))
         if event == "contact":
-            poses[:, :3, 3] += _reach(poses, swing, aside, frame, touch)[:, None] * aside
+            wall = tracer if motion is None else motion.at(frame).tracer
+            poses[:, :3, 3] += _reach(poses, swing, aside, frame, wall)[:, None] * aside
     return poses
 
 
 def _permitted(
-    points: Float[np.ndarray, "T 3"],
-    sideways: Float[np.ndarray, "T 3"],
-    clearance: Clearance,
-    settings: PhantomSettings,
+    points: Float[np.ndarray, "T 3"], sideways: Float[np.ndarray, "T 3"], tracer: Tracer, settings: PhantomSettings
 ) -> Float[np.ndarray, "T"]:
     """Share of the sideways motion that keeps the camera off the wall, smooth in time."""
     nearest = _CLEAR_OF_WALL + settings.wave + settings.breathing
-    low = _farthest(lambda share: clearance(points + share[:, None] * sideways) > nearest, np.ones(len(points)), 12)
+    low = _farthest(
+        lambda share: tracer.clearance(points + share[:, None] * sideways) > nearest, np.ones(len(points)), 12
+    )
     width = max(round(0.4 * settings.frame_rate), 1)
     return np.asarray(scipy.ndimage.gaussian_filter1d(scipy.ndimage.minimum_filter1d(low, 2 * width + 1), 0.5 * width))
 
@@ -341,17 +339,16 @@ def _reach(
     swing: Float[np.ndarray, "T"],
     aside: Float[np.ndarray, "3"],
     frame: int,
-    touch: Callable[[int], Clearance],
+    tracer: Tracer,
 ) -> Float[np.ndarray, "T"]:
     """Motion towards the wall, mm, that ends where the lens nearly touches it."""
     near = np.flatnonzero(swing > 0.0)
-    clearance = touch(frame)
 
     def is_clear(amount: float) -> bool:
         # Along the whole way, as the distance alone would be large again beyond the wall.
         way = poses[frame, :3, 3] + np.linspace(0.0, amount, 60)[:, None] * aside
         moved = poses[near, :3, 3] + (amount * swing[near])[:, None] * aside
-        return bool(min(clearance(way).min(), clearance(moved).min()) > _TOUCH)
+        return bool(min(tracer.clearance(way).min(), tracer.clearance(moved).min()) > _TOUCH)
 
     return _farthest(is_clear, 30.0, 16) * swing
 
@@ -382,12 +379,7 @@ def camera_path(
     It is at least 6 mm from the wall at rest, except in an examination.
     """
     if settings.trajectory == "examination":
-        return examining_path(
-            centre_line,
-            settings,
-            tracer.clearance,
-            lambda frame: (tracer if motion is None else motion.at(frame).tracer).clearance,
-        )
+        return examining_path(centre_line, settings, tracer, motion)
     if settings.trajectory == "inspection":
         poses = inspecting_path(centre_line, settings, tracer)
     else:
@@ -448,12 +440,24 @@ def _withdrawing_path(centre_line: CentreLine, settings: PhantomSettings, tracer
     def distances(sideways: Float[np.ndarray, "T 2"]) -> Float[np.ndarray, "T"]:
         return tracer.clearance(shifted(points, frames, sideways))
 
+    def approached(sideways: Float[np.ndarray, "T 2"], number: int) -> Float[np.ndarray, "T 2"]:
+        middle = (0.40, 0.78)[number % 2] + generator.uniform(-0.04, 0.04)
+        swing = np.exp(-0.5 * ((time - middle) / _APPROACH_WIDTH) ** 2)
+        clock = generator.uniform(0.0, 2.0 * np.pi)
+        course = np.array([np.cos(clock), np.sin(clock)])
+
+        def swung(amount: float) -> Float[np.ndarray, "T 2"]:
+            # The wobble is faded out during the approach.
+            return np.asarray(sideways * (1.0 - swing[:, None]) + amount * swing[:, None] * course)
+
+        return swung(_farthest(lambda amount: distances(swung(amount))[swing > 0.1].min() > preset.closest, 14.0, 18))
+
     for _ in range(30):
         if distances(sideways).min() >= NEAREST + 0.5:
             break
         sideways = 0.85 * sideways
-    for approach in range(0 if on_the_spot else preset.approaches):
-        sideways = _with_approach(sideways, distances, preset.closest, approach, time, generator)
+    for number in range(0 if on_the_spot else preset.approaches):
+        sideways = approached(sideways, number)
     poses = looking(shifted(points, frames, sideways), centre_line.at(arc + _LOOK_AHEAD)[0], frames)
     if not on_the_spot:
         yaw, pitch, roll = (np.radians(limit) * waver[:, 2 + axis] for axis, limit in enumerate(preset.turn))
@@ -466,25 +470,3 @@ def _withdrawing_path(centre_line: CentreLine, settings: PhantomSettings, tracer
     for pose, turn in zip(poses, np.stack([yaw, pitch, roll], axis=1), strict=True):
         pose[:3, :3] = pose[:3, :3] @ rotation(*turn)
     return poses
-
-
-def _with_approach(
-    sideways: Float[np.ndarray, "T 2"],
-    distances: Callable[[Float[np.ndarray, "T 2"]], Float[np.ndarray, "T"]],
-    closest: float,
-    number: int,
-    time: Float[np.ndarray, "T"],
-    generator: np.random.Generator,
-) -> Float[np.ndarray, "T 2"]:
-    """Lateral offsets with one approach to the wall down to ``closest`` mm."""
-    middle = (0.40, 0.78)[number % 2] + generator.uniform(-0.04, 0.04)
-    swing = np.exp(-0.5 * ((time - middle) / _APPROACH_WIDTH) ** 2)
-    clock = generator.uniform(0.0, 2.0 * np.pi)
-    direction = np.array([np.cos(clock), np.sin(clock)])
-    near = swing > 0.1
-
-    def swung(amount: float) -> Float[np.ndarray, "T 2"]:
-        # The wobble is faded out during the approach.
-        return np.asarray(sideways * (1.0 - swing[:, None]) + amount * swing[:, None] * direction)
-
-    return swung(_farthest(lambda amount: float(distances(swung(amount))[near].min()) > closest, 14.0, 18))
