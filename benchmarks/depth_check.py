@@ -18,7 +18,7 @@ from machine import show
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.scenes import Frame, Scene
-from coliags_plugin.datamanagers.reading.images import resize_nearest
+from coliags_plugin.datamanagers.file_formats import resize_nearest
 from coliags_plugin.engine.data_formats import open_scene
 
 #: Relative error below which an estimate is good, as in the definition of the confidence, and bins of confidence.

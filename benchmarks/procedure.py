@@ -36,7 +36,7 @@ from coliags_plugin.core.images import read_rgb
 from coliags_plugin.core.json_files import read_json
 from coliags_plugin.core.scene_files import read_intrinsics
 from coliags_plugin.datamanagers.colmap import read_atlas
-from coliags_plugin.datamanagers.reading.images import C3VD_DEPTH
+from coliags_plugin.datamanagers.file_formats import C3VD_DEPTH
 from coliags_plugin.geometry.lenses.models import PinholeLens
 from coliags_plugin.geometry.meshes.mesh import TriangleMesh, read_mesh
 from coliags_plugin.geometry.meshes.truth import TrueSurface, compare_meshes

@@ -147,7 +147,7 @@ def _plugin_files(path_list: str) -> dict[str, dict[str, dict[str, object]]]:
 _BUILT_INS: dict[tuple[str, str], dict[str, object]] = {
     ("datamanagers", "data manager"): {
         "auto": Resolver(
-            "coliags_plugin.datamanagers.scene_settings:SceneSettings",
+            "coliags_plugin.datamanagers.recorded:SceneSettings",
             "Reader of any scene, by the one data manager that recognises its folder (docs/data.md 1).",
         ),
         "c3vd": "coliags_plugin.datamanagers.c3vd:C3VDDataManager",

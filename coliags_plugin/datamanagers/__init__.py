@@ -1,1 +1,1 @@
-"""Data managers, one folder per dataset format; shared code in ``recorded`` and, for reading files, in ``reading``."""
+"""Data managers by dataset format; shared code in ``recorded`` and ``file_formats``."""

@@ -17,9 +17,15 @@ from typing_extensions import override
 from coliags_plugin.core import scene_files as reading
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.text_files import read_text
-from coliags_plugin.datamanagers.reading.images import C3VD_DEPTH
-from coliags_plugin.datamanagers.recorded import ROTATION, RecordedDataManager, Recording, poses_of_images
-from coliags_plugin.datamanagers.scene_settings import POINTS_FILE, SceneSettings
+from coliags_plugin.datamanagers.file_formats import C3VD_DEPTH
+from coliags_plugin.datamanagers.recorded import (
+    POINTS_FILE,
+    ROTATION,
+    RecordedDataManager,
+    Recording,
+    SceneSettings,
+    poses_of_images,
+)
 from coliags_plugin.datamanagers.shots import Rectification, Shot, make_shots, whole_frame
 from coliags_plugin.geometry.lenses.models import LENSES, Lens, OmnidirectionalLens, PinholeLens, octagon_mask
 from coliags_plugin.geometry.poses.formats import count_first_numbers

@@ -24,9 +24,15 @@ from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.core.ply import read_vertices
 from coliags_plugin.core.scenes import PointCloud
 from coliags_plugin.core.splits import Split
-from coliags_plugin.datamanagers.reading.images import C3VD_DEPTH, ScaledDepth
-from coliags_plugin.datamanagers.recorded import ROTATION, RecordedDataManager, Recording, poses_of_images
-from coliags_plugin.datamanagers.scene_settings import InitialPoints, SceneSettings
+from coliags_plugin.datamanagers.file_formats import C3VD_DEPTH, ScaledDepth
+from coliags_plugin.datamanagers.recorded import (
+    ROTATION,
+    InitialPoints,
+    RecordedDataManager,
+    Recording,
+    SceneSettings,
+    poses_of_images,
+)
 from coliags_plugin.datamanagers.shots import Rectification, Shot, make_shots, whole_frame
 from coliags_plugin.geometry.lenses.models import PinholeLens
 from coliags_plugin.geometry.poses.c3vd import C3vdPoses

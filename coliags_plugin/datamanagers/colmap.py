@@ -22,9 +22,8 @@ from coliags_plugin.core.json_files import read_json, read_number
 from coliags_plugin.core.scene_files import FACTORS, Unit, read_unit
 from coliags_plugin.core.scenes import PointCloud, SparseDepth
 from coliags_plugin.core.settings import read_validated
-from coliags_plugin.datamanagers.reading.images import DepthFormat, InverseDepth, ScaledDepth
-from coliags_plugin.datamanagers.recorded import RecordedDataManager, Recording
-from coliags_plugin.datamanagers.scene_settings import InitialPoints, SceneSettings
+from coliags_plugin.datamanagers.file_formats import DepthFormat, InverseDepth, ScaledDepth
+from coliags_plugin.datamanagers.recorded import InitialPoints, RecordedDataManager, Recording, SceneSettings
 from coliags_plugin.datamanagers.shots import Rectification, Shot
 from coliags_plugin.geometry.lenses.models import Array, MappedLens, PinholeLens
 from coliags_plugin.geometry.poses import colmap as colmap_poses

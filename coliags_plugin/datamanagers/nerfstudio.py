@@ -24,11 +24,9 @@ from coliags_plugin.core.json_files import read_number
 from coliags_plugin.core.ply import point_properties, write_ply
 from coliags_plugin.core.scene_files import FACTORS, Unit, printed_unit
 from coliags_plugin.core.scenes import PointCloud
+from coliags_plugin.datamanagers.file_formats import PixelCenters, Transforms, scaled_depth, size_of
 from coliags_plugin.datamanagers.fusion import load_points
-from coliags_plugin.datamanagers.reading.images import scaled_depth, size_of
-from coliags_plugin.datamanagers.reading.transforms import PixelCenters, Transforms
-from coliags_plugin.datamanagers.recorded import RecordedDataManager, Recording
-from coliags_plugin.datamanagers.scene_settings import POINTS_FILE, SceneSettings
+from coliags_plugin.datamanagers.recorded import POINTS_FILE, RecordedDataManager, Recording, SceneSettings
 from coliags_plugin.datamanagers.shots import Shot
 from coliags_plugin.geometry.poses.trajectory import FLIP_Y_AND_Z
 

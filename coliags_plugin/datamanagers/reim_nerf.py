@@ -18,10 +18,8 @@ from coliags_plugin.core import scene_files as reading
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.json_files import image_size, read_json, read_number
 from coliags_plugin.core.splits import Split
-from coliags_plugin.datamanagers.reading.images import DepthFormat, read_gray, read_mask
-from coliags_plugin.datamanagers.reading.transforms import Transforms
-from coliags_plugin.datamanagers.recorded import RecordedDataManager, Recording
-from coliags_plugin.datamanagers.scene_settings import SceneSettings
+from coliags_plugin.datamanagers.file_formats import DepthFormat, Transforms, read_gray, read_mask
+from coliags_plugin.datamanagers.recorded import RecordedDataManager, Recording, SceneSettings
 from coliags_plugin.datamanagers.shots import make_shots
 from coliags_plugin.geometry.lenses.models import FisheyeLens, Lens
 from coliags_plugin.geometry.poses.trajectory import natural_order

@@ -19,10 +19,9 @@ from coliags_plugin.core.json_files import read_json, read_number
 from coliags_plugin.core.scene_files import printed_unit
 from coliags_plugin.core.scenes import PointCloud
 from coliags_plugin.core.text_files import read_text, shortened
+from coliags_plugin.datamanagers.file_formats import ScaledDepth, size_of
 from coliags_plugin.datamanagers.fusion import load_points
-from coliags_plugin.datamanagers.reading.images import ScaledDepth, size_of
-from coliags_plugin.datamanagers.recorded import RecordedDataManager, Recording
-from coliags_plugin.datamanagers.scene_settings import POINTS_FILE, SceneSettings
+from coliags_plugin.datamanagers.recorded import POINTS_FILE, RecordedDataManager, Recording, SceneSettings
 from coliags_plugin.datamanagers.shots import make_shots
 from coliags_plugin.geometry.lenses.models import Lens, PinholeLens
 from coliags_plugin.geometry.lenses.vicalib import calibration_files, find_calibration

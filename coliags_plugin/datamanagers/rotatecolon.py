@@ -16,11 +16,9 @@ from coliags_plugin.core.files import user_path
 from coliags_plugin.core.scene_files import for_all, for_every, inventory, numbered, require_folder
 from coliags_plugin.core.scenes import PointCloud
 from coliags_plugin.core.splits import Split
+from coliags_plugin.datamanagers.file_formats import ExrDepth, Transforms, camera_of, size_of
 from coliags_plugin.datamanagers.fusion import load_points
-from coliags_plugin.datamanagers.reading.images import ExrDepth, size_of
-from coliags_plugin.datamanagers.reading.transforms import Transforms, camera_of
-from coliags_plugin.datamanagers.recorded import ROTATION, RecordedDataManager, Recording
-from coliags_plugin.datamanagers.scene_settings import InitialPoints, SceneSettings
+from coliags_plugin.datamanagers.recorded import ROTATION, InitialPoints, RecordedDataManager, Recording, SceneSettings
 from coliags_plugin.datamanagers.shots import Shot, make_shots
 
 log = logging.getLogger(__name__)

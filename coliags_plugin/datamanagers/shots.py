@@ -19,7 +19,7 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import has_alpha, read_alpha, read_rgb
 from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.core.scenes import PIXEL_MAPS, PixelSource, SparseDepth
-from coliags_plugin.datamanagers.reading.images import (
+from coliags_plugin.datamanagers.file_formats import (
     DepthFormat,
     all_of,
     read_gray,

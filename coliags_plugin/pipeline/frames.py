@@ -17,7 +17,7 @@ from coliags_plugin.core.files import atomic_folder, write_json
 from coliags_plugin.core.images import write_image, write_mask
 from coliags_plugin.core.jobs import Progress, with_progress
 from coliags_plugin.core.settings import read_validated
-from coliags_plugin.datamanagers.reading.images import read_mask
+from coliags_plugin.datamanagers.file_formats import read_mask
 from coliags_plugin.pipeline.frame_sources import FrameSource
 from coliags_plugin.pipeline.settings import FEWEST, FrameSettings
 from coliags_plugin.pipeline.stages import MADE

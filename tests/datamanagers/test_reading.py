@@ -16,8 +16,8 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import has_alpha, read_8_bit, read_alpha, read_rgb
 from coliags_plugin.core.scene_files import named_file, numbered, short_names
 from coliags_plugin.core.scenes import Frame
+from coliags_plugin.datamanagers.file_formats import read_mask, resize_nearest, resize_rgb, scaled_depth
 from coliags_plugin.datamanagers.fusion import fuse_depth, load_points, subsampled
-from coliags_plugin.datamanagers.reading.images import read_mask, resize_nearest, resize_rgb, scaled_depth
 
 # Images
 

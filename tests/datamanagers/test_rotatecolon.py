@@ -11,7 +11,7 @@ import OpenEXR
 import pytest
 import torch
 
-from coliags_plugin.datamanagers.reading.images import ExrDepth, read_exr_channel
+from coliags_plugin.datamanagers.file_formats import ExrDepth, read_exr_channel
 from tests.datamanagers.kinds import change_exr, change_json, files, remove, renumber
 from tests.datamanagers.wall_scenes import FRAMES, HEIGHT, WIDTH, load_scene, names, poses
 from tests.layouts import write_exr

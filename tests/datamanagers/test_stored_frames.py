@@ -16,7 +16,7 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.scene_files import parallel_map
 from coliags_plugin.core.scenes import Frame, PixelTensors, concatenate_targets
 from coliags_plugin.datamanagers import shots
-from coliags_plugin.datamanagers.reading.images import ScaledDepth, resize_nearest
+from coliags_plugin.datamanagers.file_formats import ScaledDepth, resize_nearest
 from coliags_plugin.datamanagers.shots import StoredPixels
 from coliags_plugin.engine.data_formats import find_format
 from tests.datamanagers.kinds import change_frames, change_json, files, half_size, remove, repaint

@@ -17,7 +17,7 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.jobs import Progress, with_progress
 from coliags_plugin.core.scene_files import files_in, first_few
 from coliags_plugin.core.scenes import Frame
-from coliags_plugin.datamanagers.reading.images import read_exr_channel, scaled_depth
+from coliags_plugin.datamanagers.file_formats import read_exr_channel, scaled_depth
 from coliags_plugin.reconstruction.depth.sweeping import MAX_TURN, Map, Mask
 from coliags_plugin.reconstruction.structure.features import (
     Features,

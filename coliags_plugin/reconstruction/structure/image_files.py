@@ -13,7 +13,7 @@ from jaxtyping import Bool, UInt8
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import has_alpha, read_8_bit, read_alpha
 from coliags_plugin.core.scene_files import FRAME_SUFFIXES, MASK_SUFFIXES, files_in, inventory, sidecar_files
-from coliags_plugin.datamanagers.reading.images import all_of, read_mask
+from coliags_plugin.datamanagers.file_formats import all_of, read_mask
 from coliags_plugin.geometry.poses.trajectory import natural_order
 
 log = logging.getLogger(__name__)

@@ -19,7 +19,7 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import read_rgb
 from coliags_plugin.core.scenes import Frame, Scene
 from coliags_plugin.core.settings import Settings
-from coliags_plugin.datamanagers.reading.images import all_of, read_mask
+from coliags_plugin.datamanagers.file_formats import all_of, read_mask
 from coliags_plugin.datamanagers.shots import StoredPixels
 from coliags_plugin.engine.progress import ProgressReport
 from coliags_plugin.geometry.lenses.models import Lens, PinholeLens

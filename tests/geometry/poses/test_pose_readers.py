@@ -15,7 +15,7 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.datamanagers.reading.transforms import camera_of
+from coliags_plugin.datamanagers.file_formats import camera_of
 from coliags_plugin.geometry.poses import colmap, nerfstudio, tum
 from coliags_plugin.geometry.poses.c3vd import read_poses
 from coliags_plugin.geometry.poses.formats import format_of

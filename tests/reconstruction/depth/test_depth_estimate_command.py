@@ -17,8 +17,8 @@ from scipy.spatial.transform import Rotation
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import write_image, write_mask
 from coliags_plugin.core.scene_files import write_unit
+from coliags_plugin.datamanagers.file_formats import read_gray
 from coliags_plugin.datamanagers.fusion import load_points
-from coliags_plugin.datamanagers.reading.images import read_gray
 from coliags_plugin.engine.data_formats import open_scene
 from coliags_plugin.reconstruction.depth.estimate import Estimation, WorkFolder, check_video
 from tests import commands
