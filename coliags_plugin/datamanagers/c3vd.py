@@ -6,7 +6,6 @@ import logging
 import math
 import re
 from abc import abstractmethod
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -205,8 +204,7 @@ def read_camera_intrinsics(path: Path) -> OmnidirectionalLens:
     if not pairs and all(_NUMBER.fullmatch(word) for word in words) and len(words) in (len(ORDER), len(ORDER) - 2):
         pairs = [*zip(ORDER[-len(words) :], map(float, words), strict=True)]
     values = _OPTIONAL | dict(pairs)
-    doubt = next(_doubts([name for name, _ in pairs], values, words), None)
-    if doubt is not None:
+    if doubt := _doubt([name for name, _ in pairs], values, words):
         raise InputError(
             f"{path} is ambiguous or implausible: {doubt}",
             f"each number with its name ({', '.join(ORDER)}), or the {len(ORDER)} numbers alone in that order",
@@ -218,31 +216,31 @@ def read_camera_intrinsics(path: Path) -> OmnidirectionalLens:
     )
 
 
-def _doubts(names: list[str], values: dict[str, float], words: list[str]) -> Iterator[str]:
-    """Reasons why numbers are no calibration of an omnidirectional colonoscope; ``words`` are those of the file."""
+def _doubt(names: list[str], values: dict[str, float], words: list[str]) -> str:
+    """A reason why numbers are no calibration of an omnidirectional colonoscope, or none; ``words`` of the file."""
     if not names:
         is_bare = all(_NUMBER.fullmatch(word) for word in words)
-        yield f"{f'{len(words)} numbers' if is_bare else 'text'} without names"
+        return f"{f'{len(words)} numbers' if is_bare else 'text'} without names"
     faults = {
         "no": set(ORDER) - set(values),
         "twice": {name for name in names if names.count(name) > 1},
         "unknown": set(names) - set(ORDER),
     }
     if any(faults.values()):
-        yield "; ".join(f"{what} {', '.join(sorted(listed))}" for what, listed in faults.items() if listed)
-    width, height, a0, a1, c, d, e = (values[name] for name in ("width", "height", "a0", "a1", "c", "d", "e"))
-    if not all(map(math.isfinite, values.values())) or min(width, height) < 1.0:
-        yield f"an image of {width:g} x {height:g}, or numbers that are not finite"
-    if width != round(width) or height != round(height):
-        yield f"an image of {width:g} x {height:g} pixels"
-    if max(abs(values["cx"] / width - 0.5), abs(values["cy"] / height - 0.5)) > 0.1:
-        yield f"a centre ({values['cx']:g}, {values['cy']:g}) far from the middle of {width:g} x {height:g}"
-    if not 0.2 < a0 / width < 2.0:
-        yield f"a focal length a0 = {a0:g} for {width:g} pixels"
-    if a1 != 0.0:
-        yield f"a1 = {a1:g}, which is 0 in this model"
-    if max(abs(c - 1.0), abs(d), abs(e)) > 0.1:
-        yield f"c, d, e = {c:g}, {d:g}, {e:g}, far from 1, 0, 0"
+        return "; ".join(f"{what} {', '.join(sorted(listed))}" for what, listed in faults.items() if listed)
+    width, height, cx, cy, a0, a1, *_, c, d, e = (values[name] for name in ORDER)
+    size, is_finite = f"{width:g} x {height:g}", all(map(math.isfinite, values.values()))
+    doubts = {
+        f"an image of {size}, or numbers that are not finite": not is_finite or min(width, height) < 1.0,
+        f"an image of {size} pixels": width % 1.0 or height % 1.0,
+        f"a centre ({cx:g}, {cy:g}) far from the middle of {size}": (
+            abs(cx - 0.5 * width) > 0.1 * width or abs(cy - 0.5 * height) > 0.1 * height
+        ),
+        f"a focal length a0 = {a0:g} for {width:g} pixels": not 0.2 * width < a0 < 2.0 * width,
+        f"a1 = {a1:g}, which is 0 in this model": a1 != 0.0,
+        f"c, d, e = {c:g}, {d:g}, {e:g}, far from 1, 0, 0": max(abs(c - 1.0), abs(d), abs(e)) > 0.1,
+    }
+    return next((text for text, is_wrong in doubts.items() if is_wrong), "")
 
 
 V2_LAYOUT = "rgb/NNNN.png and pose.txt, for registered videos also depth/NNNN_depth.tiff"

@@ -90,6 +90,11 @@ class SparseModel:
     colors: UInt8[np.ndarray, "P 3"]
     track_lengths: Int[np.ndarray, "P"]
 
+    @property
+    def names(self) -> list[str]:
+        """Names of the images."""
+        return [image.name for image in self.images]
+
 
 def find_models(scene: Path, parts: tuple[str, ...] = _PARTS) -> list[Path]:
     """Folders of models, by their parts, in the first parent that has any: ``sparse/0``, ``sparse/1``, ``sparse``."""
@@ -293,7 +298,7 @@ class ColmapDataManager(RecordedDataManager):
             )
             for number, lens in model.cameras.items()
         }
-        names = reading.short_names([image.name for image in model.images])
+        names = reading.short_names(model.names)
         others = reading.unposed_images(paths, (*masks, *depths))
         if atlas is None:  # else it says why images have no pose, or which other model has one
             reading.warn_of_unposed(model.files[1], others)
@@ -376,7 +381,7 @@ class ColmapDataManager(RecordedDataManager):
                 log.warning("%s is not used, as there is no %s", params, folder)
             return [None] * len(model.images), [None] * len(model.images), None
         suffixes = (".png",) if is_inverse else _DEPTH_SUFFIXES
-        depths = reading.sidecar_files(folder, [image.name for image in model.images], suffixes)
+        depths = reading.sidecar_files(folder, model.names, suffixes)
         files = reading.for_every(depths, folder, f"a file NAME{', NAME'.join(suffixes)}")
         if is_inverse and depth_unit is not None:
             raise InputError(
@@ -435,7 +440,7 @@ def _image_paths(folder: Path, model: SparseModel, outside: bool) -> list[Path]:
             "the images that the model was made from",
             "Name it with `datamanager.images_folder=FOLDER`",
         )
-    paths = {image.name: reading.named_file(folder, image.name, str(model.folder), outside) for image in model.images}
+    paths = {name: reading.named_file(folder, name, str(model.folder), outside) for name in model.names}
     return reading.for_every(
         {name: path if path.is_file() else None for name, path in paths.items()}, folder, "an image"
     )
@@ -446,7 +451,7 @@ def _masks(scene: Path, model: SparseModel) -> list[Path | None]:
     folder = reading.one_folder(scene, reading.MASK_FOLDERS)
     if folder is None:
         return [None] * len(model.images)
-    masks = [*reading.sidecar_files(folder, [image.name for image in model.images], reading.MASK_SUFFIXES).values()]
+    masks = [*reading.sidecar_files(folder, model.names, reading.MASK_SUFFIXES).values()]
     if any(folder.iterdir()) and not any(masks):
         raise InputError(
             f"{folder} holds {reading.inventory(folder)}, and no mask of any image of {model.folder}",

@@ -51,8 +51,8 @@ _TIME = re.compile(r"(\d+\.\d+)(?:_[a-z]+)?", re.IGNORECASE)
 
 #: A camera file, its lens of the stored images, and depth steps per scene unit if it gives them.
 _Camera = tuple[Path, Lens, float | None]
-#: An image, its depth file if there are any, and the index of its pose.
-_Row = tuple[Path, Path | None, int]
+#: Images, their depth files if there are any, the indices of their poses, and provenance.
+_Association = tuple[list[Path], list[Path | None], np.ndarray, dict[str, Any]]
 
 
 class RGBDSettings(SceneSettings):
@@ -120,16 +120,15 @@ class RGBDDataManager(RecordedDataManager):
         file = _find_trajectory(path, settings.trajectory)
         trajectory = tum.read(file)
         pair = self._paired_by_time if self._is_by_time(images) else self._paired_by_order
-        rows, association = pair(images, depths, trajectory, file)
-        used = [image for image, _, _ in rows]
+        used, depth_files, poses, association = pair(images, depths, trajectory, file)
         camera_file, lens, stated_scale = _find_camera(path, used[0])
         scale = self._depth_scale(stated_scale, camera_file) if depths else None
         rectification = self.rectification_of(lens, camera_file)
         masks = _files_of_images(path, reading.MASK_FOLDERS, used, "mask")
         confidences = _files_of_images(path, CONFIDENCE_FOLDERS if is_metric else (), used, "confidence")
-        depth_files, poses = [depth for _, depth, _ in rows], trajectory.camera_to_world[[pose for _, _, pose in rows]]
         form = None if scale is None else ScaledDepth(1.0 / scale)
-        shots = make_shots(used, rectification, poses, depth_files, form, "", masks, confidences)
+        camera_to_world = trajectory.camera_to_world[poses]
+        shots = make_shots(used, rectification, camera_to_world, depth_files, form, "", masks, confidences)
         facts: dict[str, Any] = {
             "layout": "TUM RGB-D",
             "trajectory": file.name,
@@ -153,7 +152,7 @@ class RGBDDataManager(RecordedDataManager):
             described_by=(file, camera_file),
             points_source=points,
             read_points=_read_mesh_points if points is not None and points.suffix == ".obj" else load_points,
-            is_complete=len(rows) == len(images) == len(trajectory),
+            is_complete=len(used) == len(images) == len(trajectory),
         )
 
     def _is_by_time(self, images: Sequence[Path]) -> bool:
@@ -170,7 +169,7 @@ class RGBDDataManager(RecordedDataManager):
 
     def _paired_by_time(
         self, images: Sequence[Path], depths: Sequence[Path], trajectory: Trajectory, file: Path
-    ) -> tuple[list[_Row], dict[str, Any]]:
+    ) -> _Association:
         """Images with a pose, and depth if there is any, in order of time; and provenance."""
         tolerance = self.settings.max_time_difference
         # Names are rounded to microseconds; pairs exactly at the tolerance must match.
@@ -204,15 +203,13 @@ class RGBDDataManager(RecordedDataManager):
             said = "%s: of %d images %d have no pose and %d no depth within %g s; they are left out"
             log.warning(said, file.parent, len(images), *without.values(), tolerance)
         difference = float(np.abs(times[used] - stamps[pose[used]]).max())
-        rows: list[_Row] = [
-            (images[index], depths[depth] if depths else None, int(pose[index]))
-            for index, depth in zip(used, deep[deep >= 0], strict=True)
-        ]
-        return rows, {"by": "time", **without, "largest_difference_s": difference}
+        facts = {"by": "time", **without, "largest_difference_s": difference}
+        deep_files = [depths[index] if depths else None for index in deep[deep >= 0]]
+        return [images[index] for index in used], deep_files, pose[used], facts
 
     def _paired_by_order(
         self, images: Sequence[Path], depths: Sequence[Path], trajectory: Trajectory, file: Path
-    ) -> tuple[list[_Row], dict[str, Any]]:
+    ) -> _Association:
         """Images in order of their numbers, each with its depth if there is any, and the pose of its place."""
         numbered, deep = _by_number(images), _by_number(depths)
         if len(trajectory) != len(numbered):
@@ -225,8 +222,7 @@ class RGBDDataManager(RecordedDataManager):
         do = "Restore the missing files, or `datamanager.depth=none`"
         names, deep_names = ([" ".join(map(str, key)) for key in files] for files in (numbered, deep))
         reading.same_frames(file.parent, names, deep_names, do)
-        rows: list[_Row] = [(image, deep.get(key), pose) for pose, (key, image) in enumerate(numbered.items())]
-        return rows, {"by": "order"}
+        return [*numbered.values()], [deep.get(key) for key in numbered], np.arange(len(numbered)), {"by": "order"}
 
     def _check_times_say_the_same(
         self, numbered: dict[tuple[int, ...], Path], trajectory: Trajectory, file: Path
