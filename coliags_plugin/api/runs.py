@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 
     from coliags_plugin.api.views import RenderedView
     from coliags_plugin.config.method_config import MethodConfig
+    from coliags_plugin.contracts import Follower
     from coliags_plugin.core.cameras import Camera
     from coliags_plugin.core.scenes import Scene
     from coliags_plugin.engine.trained import TrainedRun
@@ -41,6 +42,8 @@ if TYPE_CHECKING:
     from coliags_plugin.results.record import Result
     from coliags_plugin.surface.coverage.writing import MeasuredCoverage
     from coliags_plugin.surface.meshing.fusion import MeshedRun
+
+log = logging.getLogger(__name__)
 
 
 class Run:
@@ -128,9 +131,12 @@ class Run:
                 is not of the same video and world.
         """
         from coliags_plugin.engine import evaluator
+        from coliags_plugin.engine.data_formats import open_scene
 
-        trained = self.load()
-        other = None if options.truth is None else _scene_of_size(options.truth, trained.scene)
+        trained, other = self.load(), None
+        if options.truth is not None:
+            camera = trained.scene.train[0].camera
+            other = open_scene(options.truth, options=[f"width={camera.width}", f"height={camera.height}"])
         protocol = options.protocol or trained.config.protocol
         return evaluator.evaluate(trained, protocol, other, options.refine_poses)
 
@@ -301,21 +307,7 @@ class Run:
         return relit
 
 
-def _scene_of_size(path: Path, like: Scene) -> Scene:
-    from coliags_plugin.engine.data_formats import open_scene
-
-    camera = like.train[0].camera
-    return open_scene(path, options=[f"width={camera.width}", f"height={camera.height}"])
-
-
 load_run = Run
-
-
-if TYPE_CHECKING:
-    from coliags_plugin.contracts import Follower  # with torch
-    from coliags_plugin.core.scenes import Scene
-
-log = logging.getLogger(__name__)
 
 
 @takes(TrainOptions)

@@ -81,11 +81,7 @@ def with_options(auto: Component, name: str) -> Component:
     return named_component(auto.kind, {"name": name, **options}, f"{REGISTRIES[auto.kind].noun} {auto.name}, prefer")
 
 
-def _dump(component: Component) -> dict[str, object]:
-    return {"name": component.name, **component.settings.model_dump()}
-
-
-_DUMP = PlainSerializer(_dump)
+_DUMP = PlainSerializer(lambda component: {"name": component.name, **component.settings.model_dump()})
 DataManagerNode = Annotated[Component, PlainValidator(partial(make_component, "datamanagers")), _DUMP]
 FieldNode = Annotated[Component, PlainValidator(partial(make_component, "fields")), _DUMP]
 GeometryHeadNode = Annotated[Component, PlainValidator(partial(make_component, "geometry_heads")), _DUMP]

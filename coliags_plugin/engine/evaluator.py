@@ -140,6 +140,7 @@ def _result(
     protocol, provenance = scorer.protocol, trained.provenance
     config = plain_config(trained.config.model_dump())
     data = trained.scene if truth is None else truth.scene
+    camera = next(frame for frames in data.test_sets.values() for frame in frames).camera
     sets = {name: part.record() for name, part in evaluated.items()}
     scored = {name for part in evaluated.values() for name in part.scored}
     metrics = scorer.metrics | {name: each for name, each in scorer.further_metrics.items() if name in scored}
@@ -159,7 +160,13 @@ def _result(
             deviations,
         ),
         method=trained.method,
-        scene=_scene_record(data),
+        scene=SceneRecord(
+            name=data.name,
+            fingerprint=data.provenance.fingerprint,
+            split=data.provenance.split_name,
+            train=tuple(frame.name for frame in data.train),
+            size=(camera.width, camera.height),
+        ),
         protocol=ProtocolRecord(name=protocol.name, version=protocol.version, description=protocol.description),
         seed=trained.seed,
         steps=trained.step,
@@ -192,18 +199,6 @@ def _described(truth: Truth, original: Scene) -> JsonObject:
         **original.provenance.model_dump(include={"dataset", "unit", "fingerprint"}),
     }
     return {"scene": truth.scene.name, "matched_by": truth.matched_by, "trained_on": trained_on}
-
-
-def _scene_record(scene: Scene) -> SceneRecord:
-    """The record of a scene that has a test frame."""
-    camera = next(frame for frames in scene.test_sets.values() for frame in frames).camera
-    return SceneRecord(
-        name=scene.name,
-        fingerprint=scene.provenance.fingerprint,
-        split=scene.provenance.split_name,
-        train=tuple(frame.name for frame in scene.train),
-        size=(camera.width, camera.height),
-    )
 
 
 def _cost(trained: TrainedRun, meter: RenderMeter) -> CostRecord:

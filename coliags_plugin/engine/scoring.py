@@ -216,7 +216,8 @@ def refined_camera(model: Model, frame: Frame) -> Camera:
         model: On the frame's device.
         frame: Held out.
     """
-    camera, view = _reduced(frame.camera), frame.view(trained=False)
+    camera = frame.camera.resized(*fitted(frame.camera.width, frame.camera.height, _WITHIN))
+    view = frame.view(trained=False)
     image, valid = _area_mean(frame.rgb, camera), _area_mean(frame.valid[..., None].float(), camera)[..., 0] == 1.0
     with torch.no_grad():
         output = model.render(camera, ("rgb", "alpha", "depth_expected"), view)
@@ -254,10 +255,6 @@ def _frozen(model: nn.Module) -> Iterator[None]:
     finally:
         for parameter in learned:
             parameter.requires_grad_(True)
-
-
-def _reduced(camera: Camera) -> Camera:
-    return camera.resized(*fitted(camera.width, camera.height, _WITHIN))
 
 
 def _area_mean(values: Float[Tensor, "H W C"], camera: Camera) -> Float[Tensor, "h w C"]:
