@@ -16,7 +16,7 @@ from typing import Any
 
 import torch
 
-from coliags_plugin.config.assignments import parse_assignments
+from coliags_plugin.config.yaml_tree import parse_assignments
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.render_output import RenderOutput
 from coliags_plugin.core.scenes import Scene, View

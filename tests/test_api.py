@@ -16,7 +16,7 @@ import pytest
 import torch
 
 import coliags_plugin as cp
-from coliags_plugin.config.assignments import parse_assignments
+from coliags_plugin.config.yaml_tree import parse_assignments
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import read_rgb
 from coliags_plugin.engine.run_folder import RunFolder

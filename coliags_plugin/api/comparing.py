@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from coliags_plugin.api.runs import Run
-from coliags_plugin.config.assignments import assignments
 from coliags_plugin.config.options import AblateOptions, CompareOptions, ReportOptions, takes
+from coliags_plugin.config.yaml_tree import assignments
 from coliags_plugin.core.files import user_path
 
 if TYPE_CHECKING:

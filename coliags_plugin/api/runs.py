@@ -9,7 +9,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from coliags_plugin.config.assignments import assignments, settings_of
 from coliags_plugin.config.method_config import method_name
 from coliags_plugin.config.options import (
     CoverageOptions,
@@ -22,6 +21,7 @@ from coliags_plugin.config.options import (
     TrainOptions,
     takes,
 )
+from coliags_plugin.config.yaml_tree import assignments, settings_of
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import refuse_existing, user_path
 from coliags_plugin.engine.run_folder import RunFolder

@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from coliags_plugin.config.assignments import assignments, settings_of
 from coliags_plugin.config.options import CoverageOptions, ReconstructOptions, takes
+from coliags_plugin.config.yaml_tree import assignments, settings_of
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import refuse_existing, user_path
 

@@ -57,7 +57,7 @@ class PosesSfmCommand:
 
     def run(self) -> None:
         """Reconstruct, write the scene and print a summary."""
-        from coliags_plugin.config.assignments import settings_of
+        from coliags_plugin.config.yaml_tree import settings_of
         from coliags_plugin.engine.progress import progress_callback
         from coliags_plugin.pipeline.frame_sources import image_files, opened_recording
         from coliags_plugin.pipeline.survey import FrameSurvey

@@ -100,7 +100,7 @@ class RenderCommand(RunCommand, options.RenderOptions):
 
     def run(self) -> None:
         """Render, and print the output folder."""
-        from coliags_plugin.config.assignments import parse_assignments
+        from coliags_plugin.config.yaml_tree import parse_assignments
 
         lamp = parse_assignments(self.light)
         if lamp and self.flatten:

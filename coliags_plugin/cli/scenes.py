@@ -63,7 +63,7 @@ class PhantomCommand:
     def run(self) -> None:
         """Generate the dataset."""
         from coliags_plugin.api.scenes import make_phantom
-        from coliags_plugin.config.assignments import parse_assignments
+        from coliags_plugin.config.yaml_tree import parse_assignments
 
         names = ("preset", "trajectory", "frames", "light", "gain", "rotation_views")
         values = {name: getattr(self, name) for name in names}
@@ -149,7 +149,7 @@ class DepthCommand:
 
     def run(self) -> None:
         """Estimate, or resume; write the scene and print a summary."""
-        from coliags_plugin.config.assignments import settings_of
+        from coliags_plugin.config.yaml_tree import settings_of
         from coliags_plugin.core.files import refuse_existing, refuse_overlap
         from coliags_plugin.engine.data_formats import open_scene
         from coliags_plugin.engine.progress import progress_callback
@@ -213,7 +213,7 @@ class ReconstructCommand(options.ReconstructOptions):
     def run(self) -> None:
         """Run the stages that are not done, and print what there is."""
         from coliags_plugin.api.scenes import reconstruct
-        from coliags_plugin.config.assignments import assignments, parse_assignments
+        from coliags_plugin.config.yaml_tree import assignments, parse_assignments
         from coliags_plugin.pipeline.contents import read_contents
         from coliags_plugin.pipeline.stages import PAGE_FILE
 

@@ -17,8 +17,8 @@ from coliags_plugin.comparison.plan import (
     FailureRecord,
     read_plan,
 )
-from coliags_plugin.config.assignments import parse_assignments
 from coliags_plugin.config.options import CompareOptions
+from coliags_plugin.config.yaml_tree import parse_assignments
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import write_json
 from coliags_plugin.core.jobs import locked

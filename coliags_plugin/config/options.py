@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal, TypeVar, get_origin, get_type_hints
 
 import tyro
 
-from coliags_plugin.config.assignments import assignments
+from coliags_plugin.config.yaml_tree import assignments
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import user_path
 

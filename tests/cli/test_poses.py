@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from coliags_plugin.config.assignments import settings_of
 from coliags_plugin.config.registry import pose_formats
+from coliags_plugin.config.yaml_tree import settings_of
 from coliags_plugin.core.images import write_image, write_mask
 from coliags_plugin.core.scene_files import read_unit
 from coliags_plugin.engine.data_formats import open_scene

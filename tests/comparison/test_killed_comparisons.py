@@ -20,7 +20,7 @@ import pytest
 
 import coliags_plugin as cp
 from coliags_plugin.comparison.worker import CellTask
-from coliags_plugin.config.assignments import parse_assignments
+from coliags_plugin.config.yaml_tree import parse_assignments
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.engine import ray_executor
 from coliags_plugin.engine.ray_executor import RayExecutor

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 import coliags_plugin as cp
-from coliags_plugin.config.assignments import parse_assignments
 from coliags_plugin.config.method_config import load_method
+from coliags_plugin.config.yaml_tree import parse_assignments
 from tests.scenes import SMALL
 
 

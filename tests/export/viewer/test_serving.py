@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 
 import coliags_plugin as cp
-from coliags_plugin.config.assignments import parse_assignments
+from coliags_plugin.config.yaml_tree import parse_assignments
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import read_rgb
