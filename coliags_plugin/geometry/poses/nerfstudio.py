@@ -56,7 +56,11 @@ def read(path: Path) -> Trajectory:
     camera_to_world = np.array(matrices)
     check_rigid(camera_to_world, lambda index: f"{path}, frame {index} ({names[index]})")
     if "applied_transform" in content or "applied_scale" in content:
-        camera_to_world = _undo_applied_transform(path, content, camera_to_world)
+        applied = _matrix(content.get("applied_transform", np.eye(4)), f"{path}: applied_transform")
+        check_rigid(applied[None], lambda _: f"{path}: applied_transform")
+        scale = read_number({"applied_scale": 1.0} | content, "applied_scale", path, "a positive number", above=0.0)
+        camera_to_world[:, :3, 3] /= scale
+        camera_to_world = np.asarray(np.linalg.inv(applied) @ camera_to_world)
         remarks.append("nerfstudio's change of the world (applied_transform) is undone")
     order = natural_order(names)
     if order != list(range(len(order))):
@@ -110,15 +114,6 @@ def _matrix(value: Any, place: str) -> np.ndarray:
         row, column = np.argwhere(~np.isfinite(matrix))[0]
         raise InputError(f"{place} is {matrix[row, column]} in row {row}, column {column}", expected)
     return matrix
-
-
-def _undo_applied_transform(path: Path, content: dict[str, Any], camera_to_world: np.ndarray) -> np.ndarray:
-    applied = _matrix(content.get("applied_transform", np.eye(4)), f"{path}: applied_transform")
-    check_rigid(applied[None], lambda _: f"{path}: applied_transform")
-    scale = read_number({"applied_scale": 1.0} | content, "applied_scale", path, "a positive number", above=0.0)
-    before = camera_to_world.copy()
-    before[:, :3, 3] /= scale
-    return np.asarray(np.linalg.inv(applied) @ before)
 
 
 def _intrinsics(path: Path, content: dict[str, Any], frames: list[dict[str, Any]]) -> tuple[Intrinsics | None, str]:

@@ -253,14 +253,26 @@ _MOVED = 0.0015
 
 
 def _trial_on_tracks(models: Sequence[pycolmap.Reconstruction], video: MatchedVideo) -> _Trial:
-    """Make the trial of cameras on tracks, by held-out ones in the middle of the largest models; ties: the first."""
+    """Make the trial of cameras on tracks, by held-out ones in the middle of the largest models; ties: the first.
+
+    The error of a camera is the geometric mean over these, pixels; infinite if unknown.
+    """
+    import pycolmap
+
     large = [model for model in models[:_TRIED_MODELS] if model.num_reg_images() >= _FEWEST_TRIED] or models[:1]
     parts = [_middle_of(model, video) for model in large]
     errors: dict[Start, float] = {}
 
     def trial(cameras: Sequence[Start]) -> tuple[Start, Sequence[float]]:
         for camera in with_progress(cameras, "try cameras", video.progress):
-            errors[camera] = _test_error(parts, video, camera)
+            measured = []
+            for part in parts:
+                tried = pycolmap.Reconstruction(part)
+                with_camera(tried, video, camera)
+                adjust(tried, video.track_ids)
+                error = held_out_error(tried, video.tracks, 0.0)
+                measured += [] if error is None else [error]
+            errors[camera] = float(np.exp(np.mean(np.log(measured)))) if measured else np.inf
             shape = "" if camera.radial is None else f", distortion {camera.radial:g}"
             log.info(
                 "%s, focal length %.2f of the larger side%s: error of held-out tracks %.3f px",
@@ -280,20 +292,6 @@ def _middle_of(model: pycolmap.Reconstruction, video: MatchedVideo) -> pycolmap.
     frames = frames if len(frames) >= _FEWEST_TRIED else every
     first = max(0, (len(frames) - count) // 2)
     return part_of(model, frames[first : first + count])
-
-
-def _test_error(parts: Sequence[pycolmap.Reconstruction], video: MatchedVideo, start: Start) -> float:
-    """Geometric mean over models of the held-out error with a camera, pixels; infinite if unknown."""
-    import pycolmap
-
-    errors = []
-    for part in parts:
-        tried = pycolmap.Reconstruction(part)
-        with_camera(tried, video, start)
-        adjust(tried, video.track_ids)
-        errors.append(held_out_error(tried, video.tracks, 0.0))
-    measured = [error for error in errors if error is not None]
-    return float(np.exp(np.mean(np.log(measured)))) if measured else np.inf
 
 
 def with_camera(model: pycolmap.Reconstruction, video: MatchedVideo, start: Start) -> None:

@@ -194,11 +194,15 @@ def track_points(
     points = []
     for path in with_progress(images, "track points", progress):
         points.append(forward.advance(read_image(path), mask_of(path, masks)))
-    stretches = _around([frame.followed for frame in points])
+    near = np.zeros(len(points), bool)
+    for index, frame in enumerate(points):
+        if index and frame.followed < _BRIDGE_BELOW:
+            near[max(0, index - 2 * _LONGEST_BRIDGE) : index + 2 * _LONGEST_BRIDGE] = True
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], near, [0]])))
     next_id = forward.next_id
-    for stretch in with_progress(stretches, "track backwards", progress):
+    for first, end in with_progress(edges.reshape(-1, 2).tolist(), "track backwards", progress):
         backward = PointTracker(settings, next_id)
-        for index in reversed(stretch):
+        for index in reversed(range(first, end)):
             more = backward.advance(read_image(images[index]), mask_of(images[index], masks))
             points[index] = replace(
                 points[index],
@@ -208,16 +212,6 @@ def track_points(
             )
         next_id = backward.next_id
     return points
-
-
-def _around(followed: Sequence[int]) -> list[range]:
-    """Stretches of frames around those in which few tracks survive."""
-    near = np.zeros(len(followed), bool)
-    for index, count in enumerate(followed):
-        if index and count < _BRIDGE_BELOW:
-            near[max(0, index - 2 * _LONGEST_BRIDGE) : index + 2 * _LONGEST_BRIDGE] = True
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], near, [0]])))
-    return [range(first, end) for first, end in edges.reshape(-1, 2).tolist()]
 
 
 @dataclass(frozen=True, eq=False)
@@ -327,7 +321,11 @@ class PointTracker:
                 view = view.with_points(lost.ids[again], places)
             if len(rows) < self.bridge_below:
                 self.bridges.append(self.last)
-        view = _without_collisions(view)
+        # Without points that have met an older track.
+        order = np.argsort(view.ids)
+        cells = np.floor(view.pixels[order] / 4.0).astype(np.int64)
+        _, first = np.unique(cells[:, 1] * 100_000 + cells[:, 0], return_index=True)
+        view = view.only(order[np.sort(first)])
         followed = len(view.ids)
         view = self._with_corners(view)
         self.last = view
@@ -363,14 +361,6 @@ class PointTracker:
         ids = np.arange(self.next_id, self.next_id + len(corners))
         self.next_id += len(corners)
         return view.with_points(ids, corners.reshape(-1, 2))
-
-
-def _without_collisions(view: View) -> View:
-    """View without points that have met an older track."""
-    order = np.argsort(view.ids)
-    cells = np.floor(view.pixels[order] / 4.0).astype(np.int64)
-    _, first = np.unique(cells[:, 1] * 100_000 + cells[:, 0], return_index=True)
-    return view.only(order[np.sort(first)])
 
 
 def _there_and_back(

@@ -183,8 +183,15 @@ def read_video(
     if video is None:
         if len(some) < len(images):
             log.info("features of %d of %d images are matched", len(some), len(images))
+        described = [features_of(index) for index in with_progress(some, "find features", progress)]
+        features, brightness = zip(*described, strict=True)
+        matches = {
+            (first, second): mutual_matches(features[first], features[second], settings.max_ratio)
+            for first, second in with_progress(alike_pairs(features, settings, progress), "match features", progress)
+        }
         sharp_images, sharp_sizes = tuple(images[index] for index in some), tuple(sizes[index] for index in some)
-        video = _with_features(sharp_images, sharp_sizes, settings, lambda row: features_of(some[row]), progress)
+        keypoints = tuple(image_features.keypoints for image_features in features)
+        video = MatchedVideo(sharp_images, _named(sharp_images), sharp_sizes, keypoints, brightness, matches)
     if picture is not None:  # of one size: keypoints are those of the picture
         corner = np.array(picture.corner, np.float32)
         video = replace(
@@ -274,25 +281,6 @@ def _named(images: Sequence[Path]) -> tuple[str, ...]:
     """Names in the model, which sort in the order of the images."""
     names = file_names([path.stem for path in images], "")
     return tuple(f"{name}{path.suffix}" for name, path in zip(names, images, strict=True))
-
-
-def _with_features(
-    images: tuple[Path, ...],
-    sizes: tuple[tuple[int, int], ...],
-    settings: SfmSettings,
-    features_of: _FeaturesOf,
-    progress: Progress | None,
-) -> MatchedVideo:
-    features, brightness = zip(
-        *(features_of(index) for index in with_progress(range(len(images)), "find features", progress)), strict=True
-    )
-    pairs = alike_pairs(features, settings, progress)
-    matches = {
-        (first, second): mutual_matches(features[first], features[second], settings.max_ratio)
-        for first, second in with_progress(pairs, "match features", progress)
-    }
-    keypoints = tuple(image_features.keypoints for image_features in features)
-    return MatchedVideo(images, _named(images), sizes, keypoints, brightness, matches)
 
 
 #: Frames apart whose common tracks are matches, and fewest of them.
