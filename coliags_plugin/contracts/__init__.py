@@ -27,7 +27,6 @@ from coliags_plugin.contracts.training import (
     TrainedModel,
     TrainingStep,
 )
-from coliags_plugin.core.json_files import scalars
 
 __all__ = [
     "AppearanceHead",
@@ -59,6 +58,5 @@ __all__ = [
     "TrainingStep",
     "ViewModule",
     "log_linear",
-    "scalars",
     "steps_text",
 ]

@@ -10,8 +10,9 @@ from unittest import mock
 import pytest
 from rich.console import Console
 
-from coliags_plugin.contracts import Follower, scalars
+from coliags_plugin.contracts import Follower
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.json_files import scalars
 from coliags_plugin.engine import progress as module
 from coliags_plugin.engine.loggers import TensorBoardLogger, WandbLogger, find_loggers
 from coliags_plugin.engine.progress import ProgressReport, progress_callback
