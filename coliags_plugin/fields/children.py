@@ -85,18 +85,14 @@ def fused_children(
     ``visible`` is ascending. Differentiable once, and not in the anchors' positions.
     """
     children, count = rows.offsets.shape[1], features.shape[1]
-    first: list[Tensor] = []  # weights with inputs as rows, units as columns
-    first_biases: list[Tensor] = []
-    last: list[Tensor] = []  # with units as rows, outputs as columns
-    last_biases: list[Tensor] = []
-    for mlp in (*geometry.mlps, *appearance.mlps):
-        of_last: list[Tensor] = [mlp.get_parameter(name) for name in ("2.weight", "2.bias")]
-        if mlp is geometry.mlps[1]:
-            of_last = [_scales_first(values, children) for values in of_last]
-        first.append(_filled(mlp.get_parameter("0.weight")).t())
-        first_biases.append(_filled(mlp.get_parameter("0.bias")))
-        last.append(_filled(_filled(of_last[0]).t()))
-        last_biases.append(_filled(of_last[1]))
+    mlps = (*geometry.mlps, *appearance.mlps)
+    first = [_filled(mlp.get_parameter("0.weight")).t() for mlp in mlps]  # with inputs as rows, units as columns
+    first_biases = [_filled(mlp.get_parameter("0.bias")) for mlp in mlps]
+    weights: list[Tensor] = [mlp.get_parameter("2.weight") for mlp in mlps]
+    biases: list[Tensor] = [mlp.get_parameter("2.bias") for mlp in mlps]
+    weights[1], biases[1] = (_scales_first(values[1], children) for values in (weights, biases))
+    last = [_filled(_filled(weight).t()) for weight in weights]  # with units as rows, outputs as columns
+    last_biases = [_filled(bias) for bias in biases]
     networks = (
         torch.cat([weight[:count] for weight in first], dim=1),
         _filled(torch.cat([weight[count:] for weight in first[:2]], dim=1)),
