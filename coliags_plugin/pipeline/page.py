@@ -11,6 +11,8 @@ from urllib.parse import quote
 import numpy as np
 from markupsafe import escape
 
+from coliags_plugin.comparison.report.study import Study, read_study
+from coliags_plugin.comparison.report.views import view_section
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import read_rgb
 from coliags_plugin.pipeline.contents import Contents, SubmapContents, common_frames, read_contents
@@ -233,9 +235,6 @@ def _pictures(contents: Contents) -> Iterator[Block]:
 
 def _views(contents: Contents) -> list[Section]:
     """Section of held-out views beside their renderings by sub-map; of many sub-maps, the best and the worst."""
-    from coliags_plugin.comparison.report.study import Study, read_study
-    from coliags_plugin.comparison.report.views import view_section
-
     half, by_psnr = _SUBMAPS // 2, [submap for submap in contents.submaps if "psnr" in submap.figures]
     by_psnr.sort(key=lambda submap: submap.figures["psnr"])
     runs = []

@@ -7,28 +7,47 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import torch
+
+from coliags_plugin.checks.data.check import check_scene
+from coliags_plugin.checks.data.page import check_page, verdict
+from coliags_plugin.comparison.report.report import write_report
+from coliags_plugin.comparison.report.views import evenly
 from coliags_plugin.config.method_config import load_method, method_name
+from coliags_plugin.config.options import PageOptions, ReportOptions, TrainOptions
 from coliags_plugin.core.errors import InputError, InterruptedRunError, NotWritableError
 from coliags_plugin.core.files import write_json
 from coliags_plugin.core.jobs import Progress
 from coliags_plugin.core.scene_files import Unit
+from coliags_plugin.core.scenes import Frame, Scene
 from coliags_plugin.datamanagers.colmap import ATLAS_FILE, find_models
-from coliags_plugin.geometry.meshes.mesh import MESH_FORMATS
+from coliags_plugin.engine import evaluator
+from coliags_plugin.engine.data_formats import UNKNOWN_MEDIAN_DEPTH, open_scene
+from coliags_plugin.engine.held_light import flatten
+from coliags_plugin.engine.rendering import depth_picture, render_view, sampled_depth_limits
+from coliags_plugin.engine.run_folder import RunFolder
+from coliags_plugin.engine.scoring import Scorer
+from coliags_plugin.engine.trained import TrainedRun, load_trained
+from coliags_plugin.engine.trainer import open_training
+from coliags_plugin.export.viewer.page import save_page
+from coliags_plugin.geometry.meshes.mesh import MESH_FORMATS, read_mesh
 from coliags_plugin.geometry.poses import colmap
 from coliags_plugin.pipeline.frame_sources import Span, chosen_frames, frame_source
 from coliags_plugin.pipeline.frames import IMAGES, read_blurred, read_lens_mask, write_frames
 from coliags_plugin.pipeline.settings import FEWEST, ReconstructionSettings
 from coliags_plugin.pipeline.stages import Stage, StageRecord
 from coliags_plugin.pipeline.survey import SURVEY_FILE, Survey, Video, cut, survey_video
+from coliags_plugin.reconstruction.depth.scene import estimate_scene, training_options
+from coliags_plugin.reconstruction.structure import sfm
+from coliags_plugin.reconstruction.structure.colmap_scene import write_sfm_scene
+from coliags_plugin.reconstruction.structure.image_files import list_images
+from coliags_plugin.reporting.html_page import write_html
+from coliags_plugin.reporting.image_files import eight_bit, write_png
 from coliags_plugin.reporting.numbers import area_text, counted
-
-if TYPE_CHECKING:
-    import torch
-
-    from coliags_plugin.core.scenes import Frame, Scene
-    from coliags_plugin.engine.trained import TrainedRun
+from coliags_plugin.surface.coverage.writing import measure_scene
+from coliags_plugin.surface.meshing.fusion import mesh_run
 
 #: Share of the frames below which it is said that the poses are of a part of the video only.
 _MOST = 0.7
@@ -129,8 +148,6 @@ class StageContext:
 
     def open_posed(self, stored_size: bool = False) -> Scene:
         """The posed scene at the working size without blurred frames, its images read when they are needed."""
-        from coliags_plugin.engine.data_formats import open_scene
-
         size = self.settings.size
         options = ["initial_points=none", "keep_pixels=false", *self.model_options]
         options += [] if size is None else [f"width={size[0]}", f"height={size[1]}"]
@@ -251,14 +268,9 @@ def make_frames(context: StageContext) -> StageRecord:
 
 def make_poses(context: StageContext) -> StageRecord:
     """Estimate poses and points by structure from motion, and write them as a scene."""
-    from coliags_plugin.engine.data_formats import UNKNOWN_MEDIAN_DEPTH
-    from coliags_plugin.reconstruction.structure.colmap_scene import write_sfm_scene
-    from coliags_plugin.reconstruction.structure.image_files import list_images
-    from coliags_plugin.reconstruction.structure.sfm import millimetres, reconstruct, scaled
-
     settings = context.settings
     mask = read_lens_mask(context.frames)
-    atlas = reconstruct(list_images(context.frames / IMAGES), settings.sfm, mask, context.progress)
+    atlas = sfm.reconstruct(list_images(context.frames / IMAGES), settings.sfm, mask, context.progress)
     largest, count = atlas.largest, len(atlas.images)
     if len(largest.registered) < FEWEST:
         raise InputError(
@@ -271,9 +283,9 @@ def make_poses(context: StageContext) -> StageRecord:
     if (posed := count - len(atlas.lost)) < _MOST * count:
         warnings.append(f"{posed} of {count} frames have a pose: poses/{ATLAS_FILE} says why the others have none")
     used = [model for model in atlas.models if model is largest or len(model.registered) >= settings.least_submap]
-    factors = [millimetres(model, settings.diameter) for model in used]
+    factors = [sfm.millimetres(model, settings.diameter) for model in used]
     models = [
-        scaled(model, factor or UNKNOWN_MEDIAN_DEPTH / model.median_depth)
+        sfm.scaled(model, factor or UNKNOWN_MEDIAN_DEPTH / model.median_depth)
         for model, factor in zip(used, factors, strict=True)
     ]
     atlas = replace(atlas, models=(*models, *atlas.models[len(used) :]))
@@ -291,10 +303,6 @@ def make_poses(context: StageContext) -> StageRecord:
 
 def check_data(context: StageContext) -> StageRecord:
     """Check that images, poses and calibration agree. What is suspect is said, and does not stop."""
-    from coliags_plugin.checks.data.check import check_scene
-    from coliags_plugin.checks.data.page import check_page, verdict
-    from coliags_plugin.reporting.html_page import write_html
-
     scene = context.open_posed()
     check = check_scene(
         scene, context.progress, (lambda: context.open_posed(stored_size=True)) if scene.is_resized else None
@@ -308,8 +316,6 @@ def check_data(context: StageContext) -> StageRecord:
 
 def estimate_depth(context: StageContext) -> StageRecord:
     """Estimate dense depth with its confidence; goes on where a kill has left it."""
-    from coliags_plugin.reconstruction.depth.scene import estimate_scene
-
     summary, warnings = estimate_scene(
         context.open_posed(), context.scene, context.settings.depth, overwrite=True, progress=context.progress
     )
@@ -328,11 +334,6 @@ def steps_for(context: StageContext) -> int:
 
 def train(context: StageContext) -> StageRecord:
     """Train, or go on from the newest checkpoint."""
-    from coliags_plugin.config.options import TrainOptions
-    from coliags_plugin.engine.run_folder import RunFolder
-    from coliags_plugin.engine.trainer import open_training
-    from coliags_plugin.reconstruction.depth.scene import training_options
-
     settings = context.settings
     options = training_options(context.open_posed())
     data_format = None if context.estimates_depth else context.data_format
@@ -363,9 +364,6 @@ def train(context: StageContext) -> StageRecord:
 
 def evaluate(context: StageContext) -> StageRecord:
     """Evaluate the held-out frames."""
-    from coliags_plugin.engine import evaluator
-    from coliags_plugin.engine.trained import load_trained
-
     trained = load_trained(context.run, context.device, context.scene)
     result = evaluator.evaluate(trained, trained.config.protocol, refine_poses=True)
     folder = trained.run.evaluations / result.evaluation_name
@@ -380,9 +378,6 @@ def evaluate(context: StageContext) -> StageRecord:
 
 def _training_psnr(trained: TrainedRun) -> dict[str, float]:
     """Mean PSNR of at most 16 training views, as the protocol has it; empty where it has none."""
-    from coliags_plugin.comparison.report.views import evenly
-    from coliags_plugin.engine.scoring import Scorer
-
     scorer, frames, values = Scorer(trained.config.protocol, ["psnr"]), trained.scene.train, list[float]()
     for index in evenly(len(frames), _TRAINING_VIEWS):
         frame = frames[index].to(trained.device)
@@ -393,9 +388,6 @@ def _training_psnr(trained: TrainedRun) -> dict[str, float]:
 
 def mesh(context: StageContext) -> StageRecord:
     """Fuse the rendered depth into a mesh."""
-    from coliags_plugin.engine.trained import load_trained
-    from coliags_plugin.surface.meshing.fusion import mesh_run
-
     trained = load_trained(context.run, context.device, context.scene)
     fused = mesh_run(trained, context.run / "mesh", context.settings.mesh, overwrite=True)
     area = fused.mesh.areas.sum()
@@ -407,9 +399,6 @@ def mesh(context: StageContext) -> StageRecord:
 
 def coverage(context: StageContext) -> StageRecord:
     """Measure the share of the wall seen in the video; left out where it cannot be measured."""
-    from coliags_plugin.geometry.meshes.mesh import read_mesh
-    from coliags_plugin.surface.coverage.writing import measure_scene
-
     wall, folder = read_mesh(context.run / "mesh" / "mesh.ply"), context.run / "coverage"
     try:
         measured = measure_scene(context.open_posed(), wall, folder, context.settings.coverage, overwrite=True)
@@ -428,10 +417,6 @@ def coverage(context: StageContext) -> StageRecord:
 
 def show(context: StageContext) -> StageRecord:
     """Write the page of Gaussians and meshes along the path of the video, and pictures of some of its frames."""
-    from coliags_plugin.config.options import PageOptions
-    from coliags_plugin.engine.trained import load_trained
-    from coliags_plugin.export.viewer.page import save_page
-
     trained = load_trained(context.run, context.device, context.scene)
     depth_scale = _write_pictures(trained, context.run / "pictures")
     size, steps = _PAGES[context.folder == context.out], min(trained.step, _MOST_FIT_STEPS)
@@ -446,11 +431,6 @@ def _write_pictures(trained: TrainedRun, folder: Path) -> str:
 
     Returns what the colours of depth mean.
     """
-    from coliags_plugin.comparison.report.views import evenly
-    from coliags_plugin.engine.held_light import flatten
-    from coliags_plugin.engine.rendering import depth_picture, render_view, sampled_depth_limits
-    from coliags_plugin.reporting.image_files import eight_bit, write_png
-
     flat = flatten(trained) if trained.model.field.knows_lamp else None
     depth, video, scale = "depth_expected", trained.scene.video, ""
     if depth in trained.model.outputs:
@@ -469,10 +449,6 @@ def _write_pictures(trained: TrainedRun, folder: Path) -> str:
 
 def report(context: StageContext) -> StageRecord:
     """Write the report of the run."""
-    from coliags_plugin.comparison.report.report import write_report
-    from coliags_plugin.config.options import ReportOptions
-    from coliags_plugin.engine.run_folder import RunFolder
-
     protocol = RunFolder(context.run).method().config.protocol
     title = f"Reconstruction of {context.source.name}"
     options = ReportOptions(context.folder / "report.html", title=title, protocol=protocol)

@@ -109,13 +109,13 @@ def test_coverage_is_left_out_where_it_cannot_be_measured_but_not_where_it_canno
 ):
     scene = write_tube(tmp_path / "tube", 6, 3.0)
     monkeypatch.setattr(steps, "coverage", _COVERAGE)
-    monkeypatch.setattr("coliags_plugin.geometry.meshes.mesh.read_mesh", lambda path: None)
+    monkeypatch.setattr(steps, "read_mesh", lambda path: None)
 
     def failing(error):
         def measure_scene(*args, **options):
             raise error
 
-        monkeypatch.setattr("coliags_plugin.surface.coverage.writing.measure_scene", measure_scene)
+        monkeypatch.setattr(steps, "measure_scene", measure_scene)
 
     full = not_writable(tmp_path, OSError(errno.ENOSPC, "No space left on device"))
     failing(full)
