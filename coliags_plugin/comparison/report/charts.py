@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -17,14 +16,15 @@ from coliags_plugin.results.record import ProfileRecord
 
 #: Bins with a smaller share of the pixels are left out.
 _SMALLEST_SHARE = 1e-3
-#: Ratio of largest to smallest depth error, and loss, from which on the axis is logarithmic.
-_LOG_DEPTH_FROM, _LOG_LOSS_FROM = 20.0, 8.0
 #: Curves of more logged steps are averaged over this many intervals.
 _MOST_POINTS = 120
 #: Columns of the log against which curves are drawn: group of the charts, and label of the axis.
 _TRAINING_AXES = {"step": ("by-step", "step"), "seconds": ("by-seconds", "training time [s]")}
 #: Columns of the log that are drawn: label of the axis, and title of the chart.
-_TRAINING_CURVES = {"psnr": ("training PSNR [dB]", "PSNR of the training view at each step"), "loss": ("loss", "Loss")}
+_TRAINING_CURVES = {
+    "psnr": ("training PSNR [dB]", "PSNR of the training view at each step"),
+    "loss": ("loss, log scale", "Loss"),
+}
 #: Training log of a run: method, its style, and the columns.
 _Log = tuple[str, int, Mapping[str, np.ndarray]]
 
@@ -56,14 +56,13 @@ def _profile_charts(test_set: TestSet) -> list[Chart]:
             method: [profile for scene in shared for _, profile in by_scene[scene]]
             for method, by_scene in by_method.items()
         }
-        quantities = {"PSNR": ("PSNR [dB]", math.inf), "Depth error": (f"RMS depth error [{unit}]", _LOG_DEPTH_FROM)}
-        for title, (y_label, log_from) in quantities.items():
+        for title, y_label in {"PSNR": "PSNR [dB]", "Depth error": f"RMS depth error [{unit}]"}.items():
             lines = [
                 _profile_line(method, study.methods.index(method), pooled, of_depth=title != "PSNR")
                 for method, pooled in profiles.items()
                 if len({profile.edges for profile in pooled}) == 1
             ]
-            charts.append(_chart(lines, x_label, y_label, f"{title} against {name}", log_from, markers=True))
+            charts.append(Chart(lines, x_label, y_label, f"{title} against {name}", markers=True))
     return [chart for chart in charts if chart.has_points]
 
 
@@ -91,16 +90,10 @@ def training_section(study: Study) -> Section:
     if not logs:
         text = "No training log: only results files are here, or runs without metrics.jsonl."
         return Section("Training", [Paragraph(text)], screen_only=True)
-    hints = []
-    per_point = math.ceil(
-        max(len(columns["step"]) for curves in logs.values() for *_, columns in curves) / _MOST_POINTS
+    hint = (
+        f"Curves of more than {_MOST_POINTS} logged steps are means over intervals. There is one for each seed. Each "
+        "method has a loss of its own: compare the shapes of the curves, not their levels."
     )
-    if per_point > 1:
-        hints.append(f"Each point is the mean of up to {per_point} logged steps.")
-    if len(study.methods) > 1:
-        hints.append("Each method has a loss of its own: compare the shapes of the curves, not their levels.")
-    if any(len({method for method, *_ in curves}) < len(curves) for curves in logs.values()):
-        hints.append("One curve for each seed.")
     folded = [
         Folded(scene, [Figures(_training_charts(logs[scene]), legend=study.methods)])
         for scene in study.scenes
@@ -108,7 +101,7 @@ def training_section(study: Study) -> Section:
     ]
     folded[0] = replace(folded[0], is_open=True)
     shown = folded if len(folded) > 1 else folded[0].blocks
-    return Section("Training", [Template("curves.html"), Paragraph(" ".join(hints)), *shown], screen_only=True)
+    return Section("Training", [Template("curves.html"), Paragraph(hint), *shown], screen_only=True)
 
 
 def _training_charts(logs: Sequence[_Log]) -> list[Chart]:
@@ -120,8 +113,7 @@ def _training_charts(logs: Sequence[_Log]) -> list[Chart]:
                 for method, style, columns in logs
                 if x in columns and y in columns
             ]
-            log_from = _LOG_LOSS_FROM if y == "loss" else math.inf
-            charts.append(_chart(lines, x_label, y_label, title, log_from, group=group))
+            charts.append(Chart(lines, x_label, y_label, title, log_y=y == "loss", group=group))
     return charts
 
 
@@ -151,10 +143,3 @@ def frame_charts(study: Study) -> list[Folded]:
             figures = Figures(charts, legend=study.methods)
             folded.append(Folded(f"PSNR of each frame of {scene}", [figures], is_open=len(study.scenes) == 1))
     return folded
-
-
-def _chart(lines: Sequence[Series], x_label: str, y_label: str, title: str, log_from: float, **options: Any) -> Chart:
-    """A chart whose y axis is logarithmic if all values are positive and span a ratio of ``log_from`` or more."""
-    values = [value for line in lines for value in line.y if math.isfinite(value)]
-    log = bool(values) and min(values) > 0.0 and max(values) / min(values) >= log_from
-    return Chart(lines, x_label, f"{y_label}, log scale" if log else y_label, title, log_y=log, **options)

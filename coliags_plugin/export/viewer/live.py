@@ -72,14 +72,12 @@ def check_server(host: str, port: int) -> None:
         raise InputError(f"`port={port}`", "a number from 0 (any free port) to 65535")
     try:
         socket.create_server((host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET).close()
-    except PermissionError as error:
-        raise InputError(f"`port={port}`: {error.strerror}", "a port above 1023") from error
     except OSError as error:
         if error.errno == errno.EADDRINUSE:
             message = f"`port={port}` is in use on {host}"
             raise InputError(message, "a free port", f"Pass another, for instance `port={port + 1}`") from error
-        expected = "a name or address of this machine, for instance 127.0.0.1"
-        raise InputError(f"`host={host}`: {error.strerror or error}", expected) from error
+        expected = "a name or address of this machine, for instance 127.0.0.1, and a port above 1023"
+        raise InputError(f"`host={host}` and `port={port}`: {error.strerror or error}", expected) from error
 
 
 class Viewer(Follower):
