@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import logging
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -44,14 +43,9 @@ class CellJob(Job):
     task: CellTask
 
     def __init__(
-        self,
-        cells: Sequence[ComparisonCell],
-        comparison: ComparisonFolder,
-        executor: Executor,
-        device: str,
-        ended: Callable[[ComparisonCell, str], None],
+        self, cells: Sequence[ComparisonCell], comparison: ComparisonFolder, executor: Executor, device: str
     ) -> None:
-        self.cells, self.comparison, self.ended = cells, comparison, ended
+        self.cells, self.comparison = cells, comparison
         self.size = sum(cell.steps for cell in cells)
         cell, method, planned = cells[0], cells[0].variant.method, cells[0].planned
         self._run = comparison.run(cell)
@@ -82,14 +76,14 @@ class CellJob(Job):
         result = read_result(self.task.result)
         for cell in self.cells:
             self.comparison.add(cell, result)
-            self.ended(cell, "done")
+            log.info("%s: done", cell.title)
         return ()
 
     def fail(self, reason: str, attempts: int, ending: Ending) -> Sequence[Job]:
         """Record the failure of all cells that wait for the run."""
         for cell in self.cells:
             self.comparison.fail(cell, reason, attempts)
-            self.ended(cell, f"failed: {reason}")
+            log.info("%s: failed: %s", cell.title, reason)
         return ()
 
 
@@ -107,10 +101,6 @@ def run_cells(
             comparison.add(cell, result)
         else:
             missing.setdefault(cell.planned.key, []).append(cell)
-    numbers = itertools.count(1 + len(cells) - sum(map(len, missing.values())))
-
-    def ended(cell: ComparisonCell, how: str) -> None:
-        log.info("[%d/%d] %s: %s", next(numbers), len(cells), cell.title, how)
 
     def count_done() -> int:
         return sum(comparison.done(cell) is not None for cell in cells)
@@ -120,7 +110,7 @@ def run_cells(
         counts = {"waiting": len(cells) - sum(counts.values()), **counts}
         return ", ".join(f"{count} {phase}" for phase, count in counts.items() if count)
 
-    jobs = [CellJob(same, comparison, executor, options.device, ended) for same in missing.values()]
+    jobs = [CellJob(same, comparison, executor, options.device) for same in missing.values()]
     total = sum(cell.steps for cell in cells)
     queue = JobQueue(executor, options.retries, jobs, total, total - sum(job.size for job in jobs))
     try:

@@ -311,8 +311,6 @@ def _rendering_device(cost: CostRecord) -> str:
 
 # Leads and their tests
 
-#: The reference where it is among the methods.
-PREFERRED = "coliags"
 #: What the columns of a table of leads are.
 EXPLANATION = (
     "Lead: by how much the reference is better, mean over the scenes that both methods have; seeds are averaged "
@@ -351,7 +349,7 @@ def choose_reference(study: Study, chosen: str | None) -> str:
     if chosen is not None:
         check_name("method", chosen, study.methods)
     decided = None if study.decided is None else study.decided.reference
-    preferred = next((name for name in (chosen, decided, PREFERRED) if name in study.methods), None)
+    preferred = next((name for name in (chosen, decided, "coliags") if name in study.methods), None)
     if preferred is not None:
         return preferred
     column = metric_columns(study.test_sets[0])[0]

@@ -113,8 +113,6 @@ class GaussianAverages:
 
 #: Training views, evenly spaced, at most: whose Gaussians are averaged, and whose colours are fitted.
 _VIEWS, _COLOR_VIEWS = 120, 30
-#: Time for fitting Gaussians to what the run renders, seconds, unless another is given.
-SECONDS = 180.0
 #: Share of all blending weights that the Gaussians hold which are fitted to what the run renders.
 _FITTED_SHARE = 0.7
 
@@ -122,7 +120,7 @@ _FITTED_SHARE = 0.7
 def bake(
     trained: TrainedRun,
     light: HeldLight | None,
-    seconds: float = SECONDS,
+    seconds: float = 180.0,
     most: int | None = None,
     degree: int = MAX_DEGREE,
     attenuated: bool = False,
