@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from typing import ClassVar, Literal
 
 import torch
@@ -86,8 +85,11 @@ class DepthHuberSettings(DepthL1Settings):
 DepthLossT = TypeVar("DepthLossT", bound=DepthL1Settings, default=DepthL1Settings)
 
 
-class DepthLoss(Loss[DepthLossT]):
-    """Mean penalty of D - D_true over the valid pixels of known depth, weighted by its confidence if it is estimated.
+class DepthL1Loss(Loss[DepthLossT]):
+    """Mean |D - D_true| in mm over the valid pixels of known true depth (the paper's L_depth; docs/methods.md 4.1).
+
+    The paper writes a sum over pixels and the authors' code takes the mean; this is the mean. The authors' code also
+    pulls pixels of unknown depth towards 0; here they are ignored. Estimated depth has its confidence as weight.
 
     For ``inverse_depth_accumulated`` (E = sum w/z, what the authors' code of the paper trains on) D = 1/E where E > 0.
     Where nothing was drawn (E = 0) D is ``empty_depth``, which enters the value but has no gradient.
@@ -102,9 +104,9 @@ class DepthLoss(Loss[DepthLossT]):
         """The rendered depth that is compared."""
         return frozenset({self.settings.depth})
 
-    @abstractmethod
     def penalty(self, differences: Float[Tensor, "H W"]) -> Float[Tensor, "H W"]:
-        """Penalty of each difference in depth."""
+        """Penalty of each difference in depth: its absolute value, mm."""
+        return differences.abs()
 
     def __call__(self, step: TrainingStep) -> Float[Tensor, ""]:
         """The unweighted term; 0 where no valid pixel has a depth that is trusted at all."""
@@ -117,22 +119,10 @@ class DepthLoss(Loss[DepthLossT]):
         return weighted_mean(penalties, has_depth, step.target.depth_confidence)
 
 
-class DepthL1Loss(DepthLoss):
-    """Mean |D - D_true| in mm over the valid pixels of known true depth (the paper's L_depth; docs/methods.md 4.1).
-
-    The paper writes a sum over pixels and the authors' code takes the mean; this is the mean. The authors' code also
-    pulls pixels of unknown depth towards 0; here they are ignored.
-    """
-
-    def penalty(self, differences: Float[Tensor, "H W"]) -> Float[Tensor, "H W"]:
-        """Absolute values of the differences, mm."""
-        return differences.abs()
-
-
-class DepthHuberLoss(DepthLoss[DepthHuberSettings]):
+class DepthHuberLoss(DepthL1Loss[DepthHuberSettings]):
     """Mean Huber loss of the depth: x^2 / 2 for |x| up to ``delta``, beyond it delta (|x| - delta / 2).
 
-    Used by Gaussian Pancakes and PR-Endo (docs/rivals/gaussian-pancakes.md).
+    Otherwise as :class:`DepthL1Loss`. Used by Gaussian Pancakes and PR-Endo (docs/rivals/gaussian-pancakes.md).
     """
 
     def penalty(self, differences: Float[Tensor, "H W"]) -> Float[Tensor, "H W"]:
