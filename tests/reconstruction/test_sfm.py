@@ -13,7 +13,6 @@ import pycolmap
 import pytest
 import torch
 
-from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import read_rgb, write_image
 from coliags_plugin.engine.data_formats import open_scene
 from coliags_plugin.geometry.poses import colmap
@@ -33,6 +32,7 @@ from coliags_plugin.reconstruction.structure.sfm import (
 )
 from coliags_plugin.reconstruction.structure.sfm_settings import CameraSettings, SfmSettings, distortion
 from coliags_plugin.reporting.image_files import write_png
+from tests.commands import refuses
 from tests.textured_tube import INTRINSICS, tube_frames, write_tube
 
 KNOWN = SfmSettings(camera=CameraSettings(model="PINHOLE", params=INTRINSICS))
@@ -199,8 +199,7 @@ def test_interrupts_are_heard(tube):
 
 
 def refusal(match, tube, settings=KNOWN, masks=None):
-    with pytest.raises(InputError, match=match):
-        reconstruct(list_images(tube), settings, masks)
+    refuses(match, reconstruct, list_images(tube), settings, masks)
 
 
 def test_images_without_motion_are_refused(tube, tmp_path):
@@ -257,19 +256,14 @@ def test_images_and_masks_of_other_sizes_are_refused(tube, tmp_path):
 
 
 def test_folders_without_images_are_refused(tmp_path):
-    with pytest.raises(InputError, match=r"no folder .*nowhere"):
-        list_images(tmp_path / "nowhere")
+    refuses(r"no folder .*nowhere", list_images, tmp_path / "nowhere")
     (tmp_path / "video.mp4").write_bytes(b"film")
-    with pytest.raises(InputError, match=r"video.mp4 is a file. Expected a folder of images.*ffmpeg -i"):
-        list_images(tmp_path / "video.mp4")
-    with pytest.raises(InputError, match=r"holds 0 images"):
-        list_images(tmp_path)
+    refuses(r"video.mp4 is a file. Expected a folder of images.*ffmpeg -i", list_images, tmp_path / "video.mp4")
+    refuses(r"holds 0 images", list_images, tmp_path)
     (tmp_path / "0.png").write_bytes(b"")
     (tmp_path / "1.png").write_bytes(b"no image")
-    with pytest.raises(InputError, match=r"0.png \(0 bytes\) cannot be decoded"):
-        reconstruct(list_images(tmp_path))
-    with pytest.raises(InputError, match="1 image"):
-        reconstruct([tmp_path / "0.png"])
+    refuses(r"0.png \(0 bytes\) cannot be decoded", reconstruct, list_images(tmp_path))
+    refuses("1 image", reconstruct, [tmp_path / "0.png"])
 
 
 # Images, masks and settings
@@ -314,8 +308,7 @@ def test_images_in_order_what_hides_in_their_folder_and_what_is_not_read(tmp_pat
     assert caplog.messages == [f"{tmp_path}: 5 images are not read, as 4.HEIC: convert them"]
     for path in list_images(tmp_path):
         path.unlink()
-    with pytest.raises(InputError, match=r"holds 0 images that are read, and .*4\.HEIC.*Convert them"):
-        list_images(tmp_path)
+    refuses(r"holds 0 images that are read, and .*4\.HEIC.*Convert them", list_images, tmp_path)
 
 
 def test_masks_of_a_file_and_of_a_folder(tmp_path):
@@ -330,8 +323,7 @@ def test_masks_of_a_file_and_of_a_folder(tmp_path):
     write_image(tmp_path / "b.png", transparent)
     np.testing.assert_array_equal(mask_of(tmp_path / "b.png", masks[images[1]]), transparent[..., 3] > 0)
     np.testing.assert_array_equal(mask_of(tmp_path / "b.png", None), transparent[..., 3] > 0)
-    with pytest.raises(InputError, match=r"has no mask for c.jpg. Expected c.jpg.png or c.png"):
-        masks_for(tmp_path / "masks", [Path("c.jpg")])
+    refuses(r"has no mask for c.jpg. Expected c.jpg.png or c.png", masks_for, tmp_path / "masks", [Path("c.jpg")])
 
 
 RADIUS = 2.5
@@ -362,8 +354,7 @@ def test_the_scale_from_a_diameter_or_a_distance_and_models_of_it():
         (lambda: from_distance(before, "0.png", "5.png", 1.0), r"no image '5.png' with a pose"),
         (lambda: from_distance(before, "0.png", "0", 1.0), "coincide"),
     ):
-        with pytest.raises(InputError, match=message):
-            scale()
+        refuses(message, scale)
     after = scaled(before, 4.0)
     np.testing.assert_allclose(after.camera_to_world[:, :3, 3], 4.0 * before.camera_to_world[:, :3, 3])
     np.testing.assert_array_equal(after.camera_to_world[:, :3, :3], before.camera_to_world[:, :3, :3])

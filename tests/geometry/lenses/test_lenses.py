@@ -15,6 +15,7 @@ from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.geometry.lenses.models import LENSES, FisheyeLens, OpenCVLens, PinholeLens, octagon_mask
 from coliags_plugin.geometry.lenses.undistortion import NOWHERE, Undistortion, undistortion_map
 from coliags_plugin.geometry.lenses.vicalib import Calibration, calibration_files, find_calibration, read_calibration
+from tests.commands import refuses
 
 INTRINSICS = Intrinsics(801.0, 790.0, 660.5, 545.5, 1350, 1080)
 ALL = {**LENSES, "pinhole": PinholeLens.of(INTRINSICS)}
@@ -343,8 +344,7 @@ def test_damaged_files_are_refused(tmp_path, old, new, message):
 
 
 def test_a_missing_file_and_a_rig_of_two_cameras_are_refused(tmp_path):
-    with pytest.raises(InputError, match=r"cannot read .*gone\.xml"):
-        read_calibration(tmp_path / "gone.xml")
+    refuses(r"cannot read .*gone\.xml", read_calibration, tmp_path / "gone.xml")
     camera = VICALIB.removeprefix("<rig>").removesuffix("</rig>\n")
     with pytest.raises(InputError, match="has 2 different cameras"):
         read_calibration(write(tmp_path, f"<rig>{camera}{camera.replace('717.2', '720')}</rig>"))
@@ -361,5 +361,4 @@ def test_the_files_of_a_folder_must_agree(tmp_path):
     assert calibration_files(tmp_path) == [geometrical, photometrical]
     assert find_calibration(tmp_path).path == geometrical
     write(tmp_path, VICALIB.replace("717.2", "720"), "other.xml")
-    with pytest.raises(InputError, match=r"geometrical\.XML and other\.xml have different cameras"):
-        find_calibration(tmp_path)
+    refuses(r"geometrical\.XML and other\.xml have different cameras", find_calibration, tmp_path)

@@ -10,7 +10,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from coliags_plugin.core.errors import InputError
 from coliags_plugin.geometry.meshes.mesh import MESH_FORMATS, Texture, TriangleMesh, read_mesh, write_mesh
 from coliags_plugin.geometry.meshes.truth import (
     TrueSurface,
@@ -19,6 +18,7 @@ from coliags_plugin.geometry.meshes.truth import (
     read_true_surface,
     sample_surface,
 )
+from tests.commands import refuses
 from tests.surface.coverage.tubes import plane as grid_square
 
 CORNERS = np.array([[0, 0, 0], [2, 0, 0], [0, 3, 0], [0, 0, 4], [9, 9, 9]], np.float32)
@@ -139,10 +139,8 @@ def test_colours_of_glb_of_every_type(kind, top, tmp_path):
 )
 def test_damaged_files_are_refused(name, content, message, tmp_path):
     (tmp_path / name).write_text(content)
-    with pytest.raises(InputError, match=message):
-        read_mesh(tmp_path / name)
-    with pytest.raises(InputError, match="no file"):
-        read_mesh(tmp_path / "gone.ply")
+    refuses(message, read_mesh, tmp_path / name)
+    refuses("no file", read_mesh, tmp_path / "gone.ply")
 
 
 SQUARE = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nvt 0.25 0.5\nvt 0.75 0.5\n"
@@ -161,8 +159,7 @@ def test_a_phantom_whose_flags_of_another_mesh_are_refused(tmp_path):
         ({"other": np.ones(2, bool)}, "face_seen"),
     ):
         np.savez(tmp_path / "truth" / "mesh_seen.npz", **flags)
-        with pytest.raises(InputError, match=message):
-            read_true_surface(tmp_path)
+        refuses(message, read_true_surface, tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -186,11 +183,9 @@ def test_a_mesh_alone_says_nothing_about_what_was_seen(tmp_path):
 
 def test_a_scene_without_a_true_surface(tmp_path):
     assert find_true_surface(tmp_path) is None
-    with pytest.raises(InputError, match=r"no true surface.*coverage_mesh\.obj"):
-        read_true_surface(tmp_path)
+    refuses(r"no true surface.*coverage_mesh\.obj", read_true_surface, tmp_path)
     (tmp_path / "coverage_mesh.obj").write_text(SQUARE + "f 1/2 2/2 3/2\n")
-    with pytest.raises(InputError, match="marks no triangle"):
-        read_true_surface(tmp_path)
+    refuses("marks no triangle", read_true_surface, tmp_path)
 
 
 COUNT = 40_000
@@ -268,13 +263,11 @@ def test_samples_of_a_part():
     mesh = plane()
     points, triangles = sample_surface(mesh, 1000, mesh.centers[:, 0] > 5)
     assert points[:, 0].min() > 3.9 and (mesh.centers[triangles, 0] > 5).all()
-    with pytest.raises(InputError, match="without area"):
-        sample_surface(mesh, 10, np.zeros(len(mesh), bool))
+    refuses("without area", sample_surface, mesh, 10, np.zeros(len(mesh), bool))
 
 
 @pytest.mark.parametrize(("factor", "shift"), [(0.001, 0), (1000, 0), (1, 60)])
 def test_another_unit_or_world_is_refused(factor, shift):
     mesh = replace(plane(), vertices=plane().vertices + np.float32([30, 0, 20]))
     other = replace(mesh, vertices=np.float32(factor) * mesh.vertices + np.float32(shift))
-    with pytest.raises(InputError, match="one world and unit"):
-        compare_meshes(other, true(mesh), COUNT)
+    refuses("one world and unit", compare_meshes, other, true(mesh), COUNT)

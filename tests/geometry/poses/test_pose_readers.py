@@ -26,6 +26,7 @@ from coliags_plugin.geometry.poses.trajectory import (
     rotations_from_wxyz,
     wxyz_from_rotations,
 )
+from tests.commands import refuses
 from tests.datamanagers.wall_scenes import poses
 from tests.geometry.poses.winding import PINHOLE, as_text, some_transform, winding
 
@@ -95,10 +96,8 @@ def test_tum_almost(tmp_path):
         ("0,5;1,0;2,0;3,0;0,0;0,0;0,0;1,0", "line 2: '0,5;1,0;.*with decimal points"),
     ):
         path.write_text(f"# a comment\n{line}\n")
-        with pytest.raises(InputError, match=message):
-            tum.read(path)
-        with pytest.raises(InputError, match=re.escape(f"'{line}'")):
-            format_of(path)
+        refuses(message, tum.read, path)
+        refuses(re.escape(f"'{line}'"), format_of, path)
 
 
 def stored_w_first(path, trajectory, names=""):
@@ -228,8 +227,7 @@ FRAME = {"file_path": "a", "transform_matrix": np.eye(4).tolist()}
 def test_broken_transforms_are_refused(tmp_path, content, message):
     """Besides those of :data:`tests.datamanagers.kinds.SAID`."""
     (tmp_path / "t.json").write_text(json.dumps(content))
-    with pytest.raises(InputError, match=message):
-        nerfstudio.read(tmp_path / "t.json")
+    refuses(message, nerfstudio.read, tmp_path / "t.json")
 
 
 def write(path, matrices, separator=","):
@@ -258,8 +256,7 @@ def test_order_is_found(tmp_path, order, separator, from_origin):
 def test_without_translation_only_symmetric_rotations_can_be_read(tmp_path):
     still = poses(3)
     still[:, :3, 3] = 0.0
-    with pytest.raises(InputError, match="row-major and column-major order cannot be distinguished"):
-        read_poses(write(tmp_path / "pose.txt", still))
+    refuses("row-major and column-major order cannot be distinguished", read_poses, write(tmp_path / "pose.txt", still))
     np.testing.assert_array_equal(read_poses(write(tmp_path / "one.txt", [np.eye(4)])).camera_to_world, [np.eye(4)])
 
 
@@ -268,8 +265,7 @@ def test_lines_of_another_order_or_length_are_refused(tmp_path):
     stored = poses(5)
     stored[3] = stored[3].T
     for matrices, message in ((stored, "line 4: not a rigid transform"), (poses(5)[:, :3], "line 1: .*16 finite")):
-        with pytest.raises(InputError, match=message):
-            read_poses(write(tmp_path / "pose.txt", matrices))
+        refuses(message, read_poses, write(tmp_path / "pose.txt", matrices))
 
 
 ONE = "1 1 0 0 0 5 6 7 1 a.png\n\n"
@@ -417,16 +413,13 @@ def test_nerfstudio_has_the_cameras_of_colmap(tmp_path, model, other):
 )
 def test_models_that_are_none(tmp_path, images, cameras, message):
     """Besides those of :data:`tests.datamanagers.kinds.SAID`."""
-    with pytest.raises(InputError, match="holds no COLMAP model"):
-        colmap.read(tmp_path)
-    with pytest.raises(InputError, match=message):
-        colmap.read(write_text(tmp_path, images, cameras))
+    refuses("holds no COLMAP model", colmap.read, tmp_path)
+    refuses(message, colmap.read, write_text(tmp_path, images, cameras))
 
 
 def test_names_with_blanks_are_for_binary_models(tmp_path):
     trajectory = winding(1, names=("with blank.png",), intrinsics=PINHOLE)
-    with pytest.raises(InputError, match=r"'with blank.png'. Expected no blanks"):
-        colmap.write(tmp_path / "text", trajectory, text=True)
+    refuses(r"'with blank.png'. Expected no blanks", colmap.write, tmp_path / "text", trajectory, text=True)
     colmap.write(tmp_path / "binary", trajectory)
     assert colmap.read(tmp_path / "binary").names == trajectory.names == tuple(by_pycolmap(tmp_path / "binary"))
 
@@ -439,8 +432,7 @@ def test_binary_files_cut_anywhere_are_refused(tmp_path_factory, data):
     name = data.draw(st.sampled_from(["images.bin", "cameras.bin"]))
     content = (path / name).read_bytes()
     (path / name).write_bytes(content[: data.draw(st.integers(0, len(content) - 1))])
-    with pytest.raises(InputError, match="damaged or cut short"):
-        colmap.read(path)
+    refuses("damaged or cut short", colmap.read, path)
 
 
 def test_a_real_model_read_as_pycolmap_reads_it(shared_data, tmp_path):

@@ -9,7 +9,6 @@ import pytest
 import torch
 
 from coliags_plugin.core.cameras import Camera
-from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import write_image
 from coliags_plugin.core.scenes import Frame, SparseDepth
 from coliags_plugin.reconstruction.depth.estimate import choose_neighbours
@@ -37,6 +36,7 @@ from coliags_plugin.reconstruction.depth.sweeping import (
 )
 from coliags_plugin.reconstruction.structure.features import Pose
 from coliags_plugin.reconstruction.structure.sfm_settings import FeatureSettings
+from tests.commands import refuses
 from tests.reconstruction.depth.walls import sideways, wall_depth, wall_frames
 
 FEATURES = FeatureSettings(highlight_level=256)
@@ -228,13 +228,10 @@ def test_files_as_a_prior_in_any_scale_and_shift(tmp_path, inverse, suffix):
 
 def test_files_that_do_not_fit_are_refused(tmp_path):
     frame, depth = lit_frame()
-    with pytest.raises(InputError, match="no such folder"):
-        FilePrior.of(tmp_path / "none", [frame])
-    with pytest.raises(InputError, match="1 of 1 frames have no depth map: lit"):
-        FilePrior.of(tmp_path, [frame])
+    refuses("no such folder", FilePrior.of, tmp_path / "none", [frame])
+    refuses("1 of 1 frames have no depth map: lit", FilePrior.of, tmp_path, [frame])
     np.save(tmp_path / "lit.npy", depth[:, :60])
-    with pytest.raises(InputError, match="60 x 80 pixels, frame lit 96 x 80"):
-        FilePrior.of(tmp_path, [frame])
+    refuses("60 x 80 pixels, frame lit 96 x 80", FilePrior.of, tmp_path, [frame])
 
 
 def test_a_point_unlike_its_neighbours_stands_out_and_an_edge_does_not():
