@@ -179,28 +179,12 @@ def composite_gaussians(
     offsets = grid.centers(pairs.tile, table.dtype) - of_pairs[:, :2]
     polynomials = log_alpha_polynomials(of_pairs[:, 5], of_pairs[:, 2:5], offsets)
     pixels = monomials(grid.offsets(table))
-    sums = grid.to_image(composite(polynomials, of_pairs[:, 6:], pairs.starts, pixels, cuts))
+    composited: Tensor = _Composite.apply(polynomials, of_pairs[:, 6:], pairs.starts, pixels, cuts)  # type: ignore[no-untyped-call]
+    sums = grid.to_image(composited)
     if depths is None:
         return sums, None
     medians = median_depths(polynomials, depths[pairs.gaussian], pairs.starts, pixels, cuts)
     return sums, grid.to_image(medians[:, None])[..., 0]
-
-
-def composite(
-    polynomials: Float[Tensor, "M 6"],
-    features: Float[Tensor, "M F"],
-    starts: Int[Tensor, "tiles+1"],
-    pixels: Float[Tensor, "6 P"],
-    cuts: CutSettings,
-) -> Float[Tensor, "tiles F P"]:
-    """Sum of weight times feature over the pairs of each tile, at each of its pixels.
-
-    Differentiable (once) in ``polynomials``, of :func:`log_alpha_polynomials` by tile and front to back, and in
-    ``features``. ``starts`` is the first pair of each tile, and M; ``pixels`` are the :func:`monomials` of a tile's
-    pixel centres.
-    """
-    composited: Tensor = _Composite.apply(polynomials, features, starts, pixels, cuts)  # type: ignore[no-untyped-call]
-    return composited
 
 
 @torch.no_grad()
@@ -230,6 +214,8 @@ def _sweep_gaussians(padded: Tensor, starts: Tensor, pixels: Tensor, cuts: CutSe
 
 
 class _Composite(torch.autograd.Function):
+    """Sum of weight times feature over the pairs of each tile, by tile and front to back. [tiles, F, P]"""
+
     @staticmethod
     def forward(
         ctx: Any, polynomials: Tensor, features: Tensor, starts: Tensor, pixels: Tensor, cuts: CutSettings
@@ -267,21 +253,22 @@ def composite_surfels(
     """Composite the pairs of each tile: :class:`~coliags_plugin.renderers.stages.Stages`."""
     of_pairs = table.index_select(0, pairs.gaussian)
     origins = grid.centers(pairs.tile, of_pairs.dtype)
-    rows = pair_rows(of_pairs[:, :10], of_pairs[:, 10:12], of_pairs[:, 12], origins)
-    sums, depths = composite_pairs(rows, of_pairs[:, 13:], pairs, grid.offsets(rows), rules)
+    rows = _pair_rows(of_pairs[:, :10], of_pairs[:, 10:12], of_pairs[:, 12:13], origins)
+    pixels = torch.nn.functional.pad(grid.offsets(rows), (1, 0), value=1.0).T.contiguous()
+    sums, depths = _CompositeSurfels.apply(rows, of_pairs[:, 13:], pairs.starts, pixels, rules)  # type: ignore[no-untyped-call]
     return grid.to_image(sums), grid.to_image(depths)
 
 
-def pair_rows(
+def _pair_rows(
     intersections: Float[Tensor, "M 10"],
     filter_centers: Float[Tensor, "M 2"],
-    log_opacities: Float[Tensor, "M"],
+    log_opacities: Float[Tensor, "M 1"],
     origins: Float[Tensor, "M 2"],
 ) -> Float[Tensor, "M 13"]:
-    """Input rows of :func:`composite_pairs`, from the ``ProjectedSurfels.intersections`` of each pair's surfel.
+    """Coefficients of U, V and W in 1, x, y of the offset from the tile's midpoint, and what else pixels depend on.
 
-    These are the coefficients of U, V and W in 1, x, y of the offset from the tile's midpoint, D, the offset from there
-    to the filter's centre, and log(opacity). ``origins`` are the midpoints of the tiles, pixels.
+    That is D, the offset from the midpoint to the filter's centre, and log(opacity). ``origins`` are the midpoints of
+    the tiles, pixels; ``intersections`` those of ``ProjectedSurfels`` for each pair's surfel.
     """
     slopes = intersections[:, 2:8].reshape(-1, 3, 2)
     at_center, plane_offsets = intersections[:, 8], intersections[:, 9:]
@@ -289,25 +276,7 @@ def pair_rows(
     # At its projected centre a surfel has U = V = 0 exactly.
     constants = constants + torch.nn.functional.pad(at_center[:, None], (2, 0))
     planes = torch.cat([constants[..., None], slopes], dim=-1).flatten(1)
-    return torch.cat([planes, plane_offsets, filter_centers - origins, log_opacities[:, None]], dim=-1)
-
-
-def composite_pairs(
-    rows: Float[Tensor, "M 13"],
-    features: Float[Tensor, "M F"],
-    pairs: TilePairs,
-    offsets: Float[Tensor, "P 2"],
-    rules: SurfelRules,
-) -> tuple[Float[Tensor, "tiles F P"], Float[Tensor, "tiles 4 P"]]:
-    """Composite the pairs of each tile at each of its pixels; differentiable (once) in ``rows`` and ``features``.
-
-    ``rows`` are of :func:`pair_rows`, by tile and front to back; ``offsets`` lead from a tile's midpoint to its pixel
-    centres. With w the weight of a surfel at a pixel and z its depth there, the result is sum w f, and sum w z,
-    sum w / z, sum over pairs i < j of w_i w_j (1/z_i - 1/z_j)^2, and the median depth, 0 unless wanted.
-    """
-    pixels = torch.nn.functional.pad(offsets, (1, 0), value=1.0).T.contiguous()
-    composited: tuple[Tensor, Tensor] = _CompositeSurfels.apply(rows, features, pairs.starts, pixels, rules)  # type: ignore[no-untyped-call]
-    return composited
+    return torch.cat([planes, plane_offsets, filter_centers - origins, log_opacities], dim=-1)
 
 
 class _Hits(NamedTuple):
@@ -368,6 +337,8 @@ class _Spread:
 
 
 class _CompositeSurfels(torch.autograd.Function):
+    """Sums of weight times feature, [tiles, F, P], and of depths as in ``stages.Stages``, [tiles, 4, P]."""
+
     @staticmethod
     def forward(
         ctx: Any, rows: Tensor, features: Tensor, starts: Tensor, pixels: Tensor, rules: SurfelRules
@@ -440,7 +411,7 @@ def _of_rows(
     pixels: Tensor,
     rules: SurfelRules,
 ) -> Float[Tensor, "R 13"]:
-    """Gradients of :func:`pair_rows` from those of the logarithms of alpha and of z, with z = D / W. [R, 13]"""
+    """Gradients of :func:`_pair_rows` from those of the logarithms of alpha and of z, with z = D / W. [R, 13]"""
     on_disc = of_log_alphas * hits.on_disc * hits.inverse_w
     of_u, of_v = -on_disc * hits.u, -on_disc * hits.v
     of_w = -(of_u * hits.u + of_v * hits.v)

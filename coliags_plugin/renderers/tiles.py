@@ -78,68 +78,64 @@ class TilePairs:
 
 @dataclass(frozen=True)
 class Extents:
-    """Exact extents of the Gaussians, to where alpha falls to alpha_min."""
+    """Bounds, pixels, of where Gaussians reach alpha_min: ellipses of these covariances, up to a Mahalanobis distance.
 
-    squared_radii: Float[Tensor, "N"]  # tau: squared Mahalanobis distance where alpha = alpha_min; negative if nowhere
-    halves: Float[Tensor, "N 2"]  # half-extents of the ellipse along x and y, pixels
-    drawn: Bool[Tensor, "N"]  # whether beyond the near plane and overlapping the rectangle of pixel centres
+    Covariances and whitenings are as :class:`ProjectedGaussians` has them.
+    """
+
+    centers: Float[Tensor, "N 2"]
+    covariances: Float[Tensor, "N 3"]
+    whitenings: Float[Tensor, "N 3"]
+    squared_rims: Float[Tensor, "N"]  # squared Mahalanobis distance at the rim
+    low: Float[Tensor, "N 2"]  # corners of the bounding box
+    high: Float[Tensor, "N 2"]
+    radii: Float[Tensor, "N"]  # half the larger edge of the bounding box, rounded up, where drawn; else 0
+    drawn: Bool[Tensor, "N"]  # whether anything of the rectangle of pixel centres is reached
+
+    def reaches(
+        self, index: Tensor | slice, low: Float[Tensor, "M 2"], high: Float[Tensor, "M 2"]
+    ) -> Bool[Tensor, "M"]:
+        """True where Gaussians of these indices reach rectangles. [M]"""
+        ellipses = (self.centers[index], self.covariances[index], self.whitenings[index])
+        return _squared_distance_to_box(*ellipses, low, high) <= self.squared_rims[index]
 
 
 @torch.no_grad()
 def gaussian_extents(
     projected: ProjectedGaussians, opacities: Float[Tensor, "N"], grid: TileGrid, alpha_min: float
 ) -> Extents:
-    """Compute the extent of each Gaussian, and whether it overlaps the image."""
+    """Compute the extent of each Gaussian, with some slack, and whether it overlaps the image, without."""
     tau = 2 * torch.log(opacities / alpha_min)
-    halves = (tau.clamp_min(0)[:, None] * projected.covariances[:, ::2]).sqrt()
-    low = torch.full_like(projected.means2d, 0.5)
-    high = low.new_tensor([grid.width - 0.5, grid.height - 0.5]).expand_as(low)
-    nearest = _squared_distance_to_box(projected.means2d, projected.covariances, projected.whitenings, low, high)
-    return Extents(tau, halves, projected.in_front & (tau >= 0) & (nearest <= tau))
-
-
-@torch.no_grad()
-def bin_gaussians(projected: ProjectedGaussians, extents: Extents, grid: TileGrid) -> TilePairs:
-    """Pair the drawn Gaussians with the tiles their ellipses touch."""
-    drawn = extents.drawn.nonzero().squeeze(-1)
-    # Sorting once by depth and stably by tile afterwards leaves every tile's list front to back; Gaussians of equal
-    # depth keep the order they came in.
-    drawn = drawn[torch.argsort(projected.depths[drawn], stable=True)]
-    tau = extents.squared_radii[drawn] + RADIUS_SLACK
-    means2d, covariances = projected.means2d[drawn], projected.covariances[drawn]
-    halves = (tau[:, None] * covariances[:, ::2]).sqrt()
-    owner, column, row = _tiles_of_boxes(means2d - halves, means2d + halves, grid)
-    low, high = grid.boxes(column, row, means2d.dtype)
-    table = torch.cat([means2d, covariances, projected.whitenings[drawn], tau[:, None]], dim=-1).index_select(0, owner)
-    nearest = _squared_distance_to_box(table[:, :2], table[:, 2:5], table[:, 5:8], low, high)
-    touching = (nearest <= table[:, 8]).nonzero().squeeze(-1)
-    return _pairs_by_tile(drawn[owner[touching]], column[touching], row[touching], grid)
+    ellipses, variances = (
+        (projected.means2d, projected.covariances, projected.whitenings),
+        projected.covariances[:, ::2],
+    )
+    edge = torch.full_like(projected.means2d, 0.5)
+    size = edge.new_tensor([grid.width, grid.height]).expand_as(edge)
+    drawn = projected.in_front & (tau >= 0) & (_squared_distance_to_box(*ellipses, edge, size - edge) <= tau)
+    radii = torch.where(drawn, (tau.clamp_min(0)[:, None] * variances).sqrt().amax(-1).ceil(), 0.0)
+    rims = tau + RADIUS_SLACK
+    halves = (rims[:, None] * variances).sqrt()
+    return Extents(*ellipses, rims, projected.means2d - halves, projected.means2d + halves, radii, drawn)
 
 
 @dataclass(frozen=True)
-class SurfelExtents:
-    """Bounds, pixels, of where surfels reach alpha_min: within the image of a disc, or a circle around the centre.
+class SurfelExtents(Extents):
+    """Extents of surfels: within the image of a disc, an ellipse, or a circle around the centre."""
 
-    Covariances and whitenings are as :class:`ProjectedGaussians` has them, of the ellipse, at whose rim the Mahalanobis
-    distance is 1.
-    """
-
-    ellipse_centers: Float[Tensor, "N 2"]  # of the disc's image
-    covariances: Float[Tensor, "N 3"]
-    whitenings: Float[Tensor, "N 3"]
     circle_centers: Float[Tensor, "N 2"]
-    squared_radii: Float[Tensor, "N"]  # of the circle
-    everywhere: Bool[
-        Tensor, "N"
-    ]  # whether the disc crosses the near plane: its image is no ellipse, and may be anywhere
-    low: Float[Tensor, "N 2"]  # corners of the bounding box; of the image where everywhere
-    high: Float[Tensor, "N 2"]
-    drawn: Bool[Tensor, "N"]  # whether anything is reached
+    squared_radii: Float[Tensor, "N"]  # of the circles
+    #: Whether the disc crosses the near plane: its image is no ellipse, and may be anywhere; so is the bounding box.
+    everywhere: Bool[Tensor, "N"]
 
-    @property
-    def radii(self) -> Float[Tensor, "N"]:
-        """Half the larger edge of the bounding box in pixels, rounded up, where drawn; else 0. [N]"""
-        return torch.where(self.drawn, (0.5 * (self.high - self.low)).amax(-1).ceil(), 0.0)
+    def reaches(
+        self, index: Tensor | slice, low: Float[Tensor, "M 2"], high: Float[Tensor, "M 2"]
+    ) -> Bool[Tensor, "M"]:
+        """True where surfels of these indices reach rectangles. [M]"""
+        centers = self.circle_centers[index]
+        to_circle = (centers - centers.maximum(low).minimum(high)).square().sum(-1)
+        in_circle = to_circle <= self.squared_radii[index]
+        return self.everywhere[index] | super().reaches(index, low, high) | in_circle
 
 
 @torch.no_grad()
@@ -174,32 +170,26 @@ def surfel_extents(
     high = torch.maximum(ellipse_centers + halves, centers + radii)
     size = low.new_tensor([grid.width, grid.height])
     low, high = (torch.where(everywhere[:, None], edge, box) for edge, box in ((size * 0, low), (size, high)))
-    extents = SurfelExtents(
-        ellipse_centers, covariances, whitenings, centers, squared_radii, everywhere, low, high, bright
-    )
-    overlaps = _overlaps(extents, slice(None), torch.full_like(low, 0.5), (size - 0.5).expand_as(low))
-    return replace(extents, drawn=bright & overlaps)
+    ellipses = (ellipse_centers, covariances, whitenings, torch.ones_like(tau))
+    circles = (centers, squared_radii, everywhere)
+    extents = SurfelExtents(*ellipses, low, high, (0.5 * (high - low)).amax(-1).ceil(), bright, *circles)
+    drawn = bright & extents.reaches(slice(None), torch.full_like(low, 0.5), (size - 0.5).expand_as(low))
+    return replace(extents, radii=torch.where(drawn, extents.radii, 0.0), drawn=drawn)
 
 
 @torch.no_grad()
-def bin_surfels(projected: ProjectedSurfels, extents: SurfelExtents, grid: TileGrid) -> TilePairs:
-    """Pair the drawn surfels with the tiles they reach."""
+def bin_extents(extents: Extents, depths: Float[Tensor, "N"], grid: TileGrid) -> TilePairs:
+    """Pair what is drawn with the tiles that it reaches."""
     drawn = extents.drawn.nonzero().squeeze(-1)
-    drawn = drawn[torch.argsort(projected.depths[drawn], stable=True)]
+    # Sorting once by depth and stably by tile afterwards leaves every tile's list front to back; Gaussians of equal
+    # depth keep the order they came in.
+    drawn = drawn[torch.argsort(depths[drawn], stable=True)]
     owner, column, row = _tiles_of_boxes(extents.low[drawn], extents.high[drawn], grid)
     low, high = grid.boxes(column, row, extents.low.dtype)
-    touching = _overlaps(extents, drawn[owner], low, high).nonzero().squeeze(-1)
-    return _pairs_by_tile(drawn[owner[touching]], column[touching], row[touching], grid)
-
-
-def _overlaps(extents: SurfelExtents, index: Tensor | slice, low: Tensor, high: Tensor) -> Bool[Tensor, "M"]:
-    """True if surfels reach rectangles. [M], [M, 2], [M, 2]"""
-    in_ellipse = _squared_distance_to_box(
-        extents.ellipse_centers[index], extents.covariances[index], extents.whitenings[index], low, high
-    )
-    centers = extents.circle_centers[index]
-    to_circle = (centers - centers.maximum(low).minimum(high)).square().sum(-1)
-    return extents.everywhere[index] | (in_ellipse <= 1) | (to_circle <= extents.squared_radii[index])
+    touching = extents.reaches(drawn[owner], low, high).nonzero().squeeze(-1)
+    tile, order = torch.sort((row * grid.columns + column)[touching], stable=True)
+    starts = torch.searchsorted(tile, torch.arange(grid.columns * grid.rows + 1, dtype=tile.dtype, device=tile.device))
+    return TilePairs(gaussian=drawn[owner[touching[order]]], tile=tile.long(), starts=starts)
 
 
 def _tiles_of_boxes(
@@ -222,15 +212,6 @@ def _tiles_of_boxes(
     row = torch.div(place, across_of_owner, rounding_mode="floor")
     column = place - row * across_of_owner + first_tile[:, 0].int()[owner]
     return owner, column, row + first_tile[:, 1].int()[owner]
-
-
-def _pairs_by_tile(
-    gaussian: Int[Tensor, "M"], column: Int[Tensor, "M"], row: Int[Tensor, "M"], grid: TileGrid
-) -> TilePairs:
-    """Sort pairs by tile; within a tile they keep their order. [M], [M], [M]"""
-    tile, order = torch.sort(row * grid.columns + column, stable=True)
-    starts = torch.searchsorted(tile, torch.arange(grid.columns * grid.rows + 1, dtype=tile.dtype, device=tile.device))
-    return TilePairs(gaussian=gaussian[order], tile=tile.long(), starts=starts)
 
 
 def _squared_distance_to_box(

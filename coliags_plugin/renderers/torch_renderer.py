@@ -17,7 +17,7 @@ from coliags_plugin.renderers.compositing import composite_gaussians, composite_
 from coliags_plugin.renderers.projection import facing_normals, project_gaussians, project_surfels
 from coliags_plugin.renderers.splatting import CutSettings, SplattingRenderer
 from coliags_plugin.renderers.stages import Placed, Stages, draw_view
-from coliags_plugin.renderers.tiles import TileGrid, bin_gaussians, bin_surfels, gaussian_extents, surfel_extents
+from coliags_plugin.renderers.tiles import TileGrid, bin_extents, gaussian_extents, surfel_extents
 
 
 class TorchRendererSettings(CutSettings):
@@ -51,9 +51,8 @@ def _place_gaussians(
     extents = gaussian_extents(projected, gaussians.opacities, grid, settings.alpha_min)
     columns = (projected.means2d, projected.whitenings, _log_opacities(gaussians, extents.drawn))
     normals = facing_normals(projected, gaussians.scales) if with_normals else None
-    radii = torch.where(extents.drawn, extents.halves.amax(-1).ceil(), 0.0)
-    pairs = bin_gaussians(projected, extents, grid)
-    return Placed(projected.means2d, columns, projected.depths, normals, radii, pairs)
+    pairs = bin_extents(extents, projected.depths, grid)
+    return Placed(projected.means2d, columns, projected.depths, normals, extents.radii, pairs)
 
 
 def _place_surfels(
@@ -62,7 +61,7 @@ def _place_surfels(
     projected = project_surfels(gaussians, camera)
     extents = surfel_extents(projected, gaussians.opacities, camera, grid, settings)
     columns = (projected.intersections, projected.filter_centers, _log_opacities(gaussians, extents.drawn))
-    pairs = bin_surfels(projected, extents, grid)
+    pairs = bin_extents(extents, projected.depths, grid)
     return Placed(projected.means2d, columns, projected.depths, projected.normals, extents.radii, pairs)
 
 
