@@ -58,13 +58,9 @@ class VolumeRendererSettings(Settings):
     """Rays per batch when rendering whole images; bounds memory."""
 
     @model_validator(mode="after")
-    def _bounds_are_distances(self) -> Self:
+    def _check(self) -> Self:
         if self.spacing == "depth" and self.far_plane is None:
             raise ValueError("far_plane null with spacing 'depth': a field's own is a distance")
-        return self
-
-    @model_validator(mode="after")
-    def _enough_to_refine(self) -> Self:
         if self.importance_samples and self.samples < 3:
             raise ValueError(f"importance_samples with samples {self.samples}: expected at least 3")
         return self

@@ -37,7 +37,7 @@ TYPES = {
 
 def of_renderer():
     """Kernels for images of few and many channels, with all outputs: name, kernel, types, constants and options."""
-    from coliags_plugin.renderers.triton_kernels import binning, geometry, projection, surfel_projection, sweeps
+    from coliags_plugin.renderers.triton_kernels import geometry, projection, sweeps
 
     everything = dict.fromkeys(("WITH_MEDIANS", "WITH_DEPTHS", "WITH_NORMALS"), True)
     composited = [
@@ -52,17 +52,16 @@ def of_renderer():
     placed = [
         (kernel, geometry.WARPS, {"SIZE": sweeps.TILE_SIZE, "BLOCK": geometry.BLOCK, "EMIT": emit})
         for kernel, emits in (
-            (projection.forward, [0]), (projection.backward, [0]), (binning.find_pairs, [False, True]),
-            *((kernel, [0]) for kernel in (surfel_projection.centers, surfel_projection.centers_backward)),
-            *((kernel, [0]) for kernel in (surfel_projection.forward, surfel_projection.backward)),
+            (projection.forward, [0]), (projection.backward, [0]), (geometry.find_pairs, [False, True]),
+            *((kernel, [0]) for kernel in (projection.centers, projection.centers_backward)),
+            *((kernel, [0]) for kernel in (projection.surfels_forward, projection.surfels_backward)),
         )
         for emit in emits
     ]  # fmt: skip
     for kernel, warps, blocks in composited + placed:
         variant = ".".join(str(blocks[name]) for name in ("CHANNELS", "EMIT") if name in blocks)
         name = f"{kernel.__module__.rsplit('.')[-1]}.{kernel.__name__}.{variant}"
-        of_surfels = kernel.__module__.endswith("surfel_projection")
-        sums = "*fp64" if of_surfels else "*fp32"
+        sums = "*fp64" if kernel.__name__ in ("centers_backward", "surfels_backward") else "*fp32"
         types = TYPES | {"tiles": "*i32", "of_pose": sums} | structures(geometry, sums)
         yield name, kernel, types, blocks | everything, {"num_warps": warps, "enable_fp_fusion": True}
 

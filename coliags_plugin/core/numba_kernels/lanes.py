@@ -529,21 +529,14 @@ def _columns_of_four(builder: ir.IRBuilder, rows: list[ir.Value]) -> list[ir.Val
     return columns
 
 
-def _prefetching(name: str, writes: int) -> Any:
-    def emit(builder: ir.IRBuilder, table: ir.Value, index: ir.Value) -> None:
-        address = _at(builder, table, index, ir.IntType(8))
-        kind = ir.FunctionType(ir.VoidType(), [address.type, _INT, _INT, _INT])
-        function = builder.module.declare_intrinsic("llvm.prefetch", [address.type], kind)
-        # Into all levels of the cache for data.
-        builder.call(function, [address, *(ir.Constant(_INT, value) for value in (writes, 3, 1))])
-
-    return operation(None, TABLE, INDEX, name=name)(emit)
-
-
-#: Prefetch the cache line of ``table[index]``
-prefetch = _prefetching("prefetch", 0)
-#: Prefetch the cache line of ``table[index]`` to write it
-prefetch_to_write = _prefetching("prefetch_to_write", 1)
+@operation(None, TABLE, INDEX)
+def prefetch(builder, table, index):
+    """Prefetch the cache line of ``table[index]``."""
+    address = _at(builder, table, index, ir.IntType(8))
+    kind = ir.FunctionType(ir.VoidType(), [address.type, _INT, _INT, _INT])
+    function = builder.module.declare_intrinsic("llvm.prefetch", [address.type], kind)
+    # To read, into all levels of the cache for data.
+    builder.call(function, [address, *(ir.Constant(_INT, value) for value in (0, 3, 1))])
 
 
 @operation(AS_LONG, TABLE, INDEX, LENGTH)

@@ -66,8 +66,8 @@ def gathering(of_center: Callable[..., tuple[float, float]]) -> Callable[..., No
             for place in range(first, last):
                 ahead = bins.nearest_first[min(place + _AHEAD, last - 1)]
                 vec.prefetch(records, layout.ROW * ahead)
-                vec.prefetch_to_write(gaussian_sums, layout.ROW * ahead)
-                vec.prefetch_to_write(of_means2d, 2 * ahead)
+                vec.prefetch(gaussian_sums, layout.ROW * ahead)
+                vec.prefetch(of_means2d, 2 * ahead)
                 index = bins.nearest_first[place]
                 total, last_total = vec.splat(0.0), np.float32(0.0)
                 for _ in range(bins.entry_counts[place]):

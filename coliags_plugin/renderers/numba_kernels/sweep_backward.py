@@ -66,7 +66,7 @@ def sweeping_backward(
                     vec.store(state, at + tiles.TRANSMITTANCE, vec.select(tiles.inside(block, across, down), 1.0, 0.0))
                     vec.store(state, at + _X, x)
                     vec.store(state, at + _Y, y)
-                tiles.copy_from_images(tile, grid, of_images, state)
+                tiles.copy_pixels(tile, grid, state, of_images, False)
                 for block in range(layout.BLOCKS):
                     source = size * (layout.BLOCKS * tile + block)
                     prepare_block(tiles.STATE * block, source, outputs, view, composited, state)
@@ -90,7 +90,7 @@ def sweeping_backward(
             fetch(first, end, alive, corner_x, corner_y, projections, view, cells, rows, blocks)
             for entry in range(first, end):
                 ahead = cells[layout.CELL * min(entry + tiles.SUMS_AHEAD, last - 1) + 2]
-                vec.prefetch_to_write(entry_sums, layout.ROW * ahead)
+                vec.prefetch(entry_sums, layout.ROW * ahead)
                 fetched, mine = row * (entry - first), blocks[entry - first] & alive
                 number = cells[layout.CELL * entry + 2]
                 target, beyond = layout.ROW * number, further + number

@@ -39,7 +39,7 @@ def sweeping(fetch: Callable[..., None], sweep_block: Callable[..., int], row: i
             tile = bins.order[place]
             bins.reached[tile] = sweep_tile(tile, projections, bins, view, grid, outputs, rows, state, blocks)
             _finish_tile(tile, outputs, view, state, composited)
-            tiles.copy_to_images(tile, grid, state, images)
+            tiles.copy_pixels(tile, grid, state, images, True)
 
     @part
     def sweep_tile(tile, projections, bins, view, grid, outputs, rows, state, blocks):

@@ -186,56 +186,33 @@ def list_by_block(count, stride, blocks, listed, counts):
         counts[block + 2], counts[block + 3] = c - CHUNK * (block + 2), d - CHUNK * (block + 3)
 
 
-@inline
-def _single_channels(images):
-    """Images of one channel, each after its vector in the blocks of a tile."""
-    return (
+@part
+def copy_pixels(tile, grid, state, images, outwards):
+    """Copy the pixels of a tile from its blocks to the images that are not empty, or from these to the blocks."""
+    for channel in range(3):
+        _copy_channel(tile, grid, state, CHANNELS + 16 * channel, images.rgb, 3, channel, outwards)
+        _copy_channel(tile, grid, state, NORMALS + 16 * channel, images.normals, 3, channel, outwards)
+    for vector, image in (
         (ALPHA, images.alpha),
         (DEPTH, images.depth),
         (INVERSE, images.inverse_depth),
         (MEDIAN, images.median),
         (EXPECTED, images.expected),
         (DISTORTION, images.distortion),
-    )
+    ):
+        _copy_channel(tile, grid, state, vector, image, 1, 0, outwards)
 
 
 @part
-def copy_to_images(tile, grid, state, images):
-    """Copy the pixels of a tile from its blocks to the images that are not empty."""
-    for channel in range(3):
-        _copy_to_image(CHANNELS + 16 * channel, state, tile, grid, 3, channel, images.rgb)
-        _copy_to_image(NORMALS + 16 * channel, state, tile, grid, 3, channel, images.normals)
-    for vector, image in _single_channels(images):
-        _copy_to_image(vector, state, tile, grid, 1, 0, image)
-
-
-@part
-def _copy_to_image(vector, state, tile, grid, depth, channel, image):
-    """Copy a vector of a tile's blocks to one of the ``depth`` channels of an image."""
+def _copy_channel(tile, grid, state, vector, image, depth, channel, outwards):
+    """Copy a vector of a tile's blocks to one of the ``depth`` channels of an image, or the other way."""
     if len(image):
         corner_x, corner_y, across, down = tile_corner(tile, grid)
         for y in range(down):
             first = ((corner_y + y) * grid.width + corner_x) * depth + channel
             for x in range(across):
-                image[first + x * depth] = vec.number(state, vector + place_in_blocks(x, y))
-
-
-@part
-def copy_from_images(tile, grid, images, state):
-    """Copy the pixels of a tile from the images that are not empty to its blocks."""
-    for channel in range(3):
-        _copy_from_image(images.rgb, 3, channel, tile, grid, CHANNELS + 16 * channel, state)
-        _copy_from_image(images.normals, 3, channel, tile, grid, NORMALS + 16 * channel, state)
-    for vector, image in _single_channels(images):
-        _copy_from_image(image, 1, 0, tile, grid, vector, state)
-
-
-@part
-def _copy_from_image(image, depth, channel, tile, grid, vector, state):
-    """Copy one of the ``depth`` channels of an image to a vector of a tile's blocks."""
-    if len(image):
-        corner_x, corner_y, across, down = tile_corner(tile, grid)
-        for y in range(down):
-            first = ((corner_y + y) * grid.width + corner_x) * depth + channel
-            for x in range(across):
-                state[vector + place_in_blocks(x, y)] = vec.number(image, first + x * depth)
+                pixel, place = first + x * depth, vector + place_in_blocks(x, y)
+                if outwards:
+                    image[pixel] = vec.number(state, place)
+                else:
+                    state[place] = vec.number(image, pixel)

@@ -16,8 +16,7 @@ from coliags_plugin.renderers.projection import slope_limits
 from coliags_plugin.renderers.splatting import CutSettings
 from coliags_plugin.renderers.stages import Placed
 from coliags_plugin.renderers.tiles import ELLIPSE_SLACK, RADIUS_SLACK, TileGrid, TilePairs
-from coliags_plugin.renderers.triton_kernels import projection, surfel_projection
-from coliags_plugin.renderers.triton_kernels.binning import find_pairs
+from coliags_plugin.renderers.triton_kernels import projection
 from coliags_plugin.renderers.triton_kernels.geometry import (
     BLOCK,
     OUTLINE_COLUMNS,
@@ -28,6 +27,7 @@ from coliags_plugin.renderers.triton_kernels.geometry import (
     Projected,
     Tables,
     View,
+    find_pairs,
 )
 
 
@@ -133,7 +133,7 @@ class _Centers(torch.autograd.Function):
         ctx.save_for_backward(means, pose)
         ctx.view = _view(means, camera)
         means2d = means.new_empty(len(means), 2)
-        surfel_projection.centers[_programs(len(means))](means, pose, means2d, ctx.view, **_OPTIONS)
+        projection.centers[_programs(len(means))](means, pose, means2d, ctx.view, **_OPTIONS)
         return means2d
 
     @staticmethod
@@ -141,7 +141,7 @@ class _Centers(torch.autograd.Function):
     def backward(ctx: Any, of_means2d: Tensor) -> tuple[Tensor | None, ...]:
         means, pose = ctx.saved_tensors
         of_means, of_pose = torch.empty_like(means), _pose_sums(means, torch.float64)
-        surfel_projection.centers_backward[_programs(len(means))](
+        projection.centers_backward[_programs(len(means))](
             means, pose, of_means2d.contiguous(), of_means, of_pose, ctx.view, **_OPTIONS
         )
         return of_means, _of_pose(of_pose), None
@@ -165,13 +165,13 @@ class _Surfels(torch.autograd.Function):
         ctx.view = _view(means, camera)
         projected = Projected(
             means2d,
-            means.new_empty(len(means), surfel_projection.SHAPE_COLUMNS.value),
+            means.new_empty(len(means), projection.SHAPE_COLUMNS.value),
             torch.empty_like(opacities),
             torch.empty_like(opacities),
             torch.empty_like(means),
         )
         limits = Cuts(ELLIPSE_SLACK, cuts.alpha_min, RADIUS_SLACK, cuts.surfel_filter)
-        surfel_projection.forward[_programs(len(means))](
+        projection.surfels_forward[_programs(len(means))](
             surfels, projected, extents, ctx.view, limits, _grid(grid), SIZE=grid.size, **_OPTIONS
         )
         ctx.save_for_backward(*surfels, extents.boxes)
@@ -190,7 +190,7 @@ class _Surfels(torch.autograd.Function):
         # Centres and depths have gradients of their own.
         gradients = (None, of_shapes, None, of_log_opacities, of_normals)
         of_projected = Projected(*_contiguous(*gradients, otherwise=surfels.means))
-        surfel_projection.backward[_programs(len(of_means2d))](
+        projection.surfels_backward[_programs(len(of_means2d))](
             surfels, boxes, of_projected, of_means2d, of_surfels, ctx.view, **_OPTIONS
         )
         return of_means2d, *of_surfels[:4], _of_pose(of_surfels.pose), None, None, None
