@@ -24,7 +24,15 @@ from coliags_plugin.renderers.triton_renderer import TritonRenderer
 from tests.renderers import test_surfels as surfels
 from tests.renderers import test_torch_renderer as solids
 from tests.renderers.test_surfels import as_surfels, make_surfels, outputs_of
-from tests.renderers.test_torch_renderer import INPUTS, cast, pinhole, random_gaussians, relative, render_gaussians
+from tests.renderers.test_torch_renderer import (
+    INPUTS,
+    cast,
+    make,
+    pinhole,
+    random_gaussians,
+    relative,
+    render_gaussians,
+)
 
 PRIMITIVES = ("gaussians3d", "surfels")
 of_each = pytest.mark.parametrize("primitive", PRIMITIVES)
@@ -59,7 +67,6 @@ SLOW_IN_INTERPRETER = (
     pytest.param(Interpreted, id="triton", marks=[needs_triton, pytest.mark.thorough]),
     RENDERERS[2],
 )
-by_each = pytest.mark.parametrize("renderer", RENDERERS)
 by_each_at_length = pytest.mark.parametrize("renderer", SLOW_IN_INTERPRETER)
 #: How far the cut-offs are moved, relative to themselves: more than float32 can be off by.
 CUTOFF_MARGIN = 2e-5
@@ -325,32 +332,32 @@ def test_any_size(renderer, primitive, n, width, height, seed):
     assert all(gradient is None or torch.isfinite(gradient).all() for gradient in gradients.values())
 
 
-@by_each
-@pytest.mark.parametrize("near_plane", [0.0, 0.2])
-def test_what_is_not_drawn_leaves_no_trace(renderer, near_plane):
-    """Behind the camera, of no area, too faint, beside the image."""
-    means = [[0, 0, -3.0], [0, 0, 2.0], [0, 0, 2.0], [50.0, 0, 2.0]]
-    scales = torch.tensor([[0.3, 0.3], [0.3, 0.0], [0.3, 0.3], [0.3, 0.3]])
-    gaussians = make_surfels(means, scales, torch.tensor([0.9, 0.9, 1 / 256, 0.9]))
+@pytest.mark.parametrize("renderer", [TorchRenderer, *RENDERERS])
+@pytest.mark.parametrize(
+    ("made", "mean", "scales", "opacity", "quat"),
+    [
+        *((make, [0, 0, depth], 0.3, 0.7, [1.0, 0, 0, 0]) for depth in (-3.0, 0.0, 0.1, 0.25)),
+        *((each, [0, 0, 4.0], 0.3, 1 / 256, [1.0, 0, 0, 0]) for each in (make, make_surfels)),
+        *((each, [], 0.3, 0.7, [1.0, 0, 0, 0]) for each in (make, make_surfels)),
+        *((make_surfels, [0, 0, depth], 0.3, 0.7, [1.0, 0, 0, 0]) for depth in (-3.0, 0.25)),
+        (make_surfels, [0, 0, 3.0], 0.3, 0.7, [0.5, 0.5, 0.5, 0.5]),  # exactly edge-on: its normal is the x axis
+        (make_surfels, [0, 0, 3.0], (0.3, 0.0), 0.7, [1.0, 0, 0, 0]),
+        (make_surfels, [90.0, 0, 3.0], 0.3, 0.7, [1.0, 0, 0, 0]),
+    ],
+)
+def test_what_is_not_drawn_gets_no_gradient(renderer, made, mean, scales, opacity, quat):
+    gaussians = made(mean, scales, opacity, quats=torch.tensor([quat]).expand(len(mean) // 3, 4))
     gaussians = cast(gaussians, torch.float32, grad=True)
-    options = TorchRendererSettings(background=(0.1, 0.2, 0.3))
-    camera = dataclasses.replace(pinhole(dtype=torch.float32), near_plane=near_plane)
-    output = render_gaussians(gaussians, camera, OUTPUTS, options, renderer=renderer)
-    assert torch.equal(output.rgb, torch.tensor([0.1, 0.2, 0.3]).expand(7, 9, 3))
-    assert not any(output[name].any() for name in OUTPUTS if name != "rgb")
-    assert not output.splats.radii.any()
-    sum(output[name].sum() for name in OUTPUTS).backward()
-    assert not any(getattr(gaussians, name).grad.any() for name in INPUTS)
-
-
-@by_each
-def test_the_median_depth_has_a_gradient(renderer):
-    gaussians = cast(make_surfels([[0, 0, 2.0], [0, 0, 3.0]], 1e2, 0.4), torch.float32, grad=True)
-    output = render_gaussians(gaussians, pinhole(dtype=torch.float32), OUTPUTS, renderer=renderer)
-    assert torch.equal(output["depth_median"], torch.full((7, 9), 3.0))
-    output["depth_median"][3, 4].backward()
-    torch.testing.assert_close(gaussians.means.grad, torch.tensor([[0.0, 0, 0], [0, 0, 1.0]]), rtol=0, atol=1e-6)
-    assert not gaussians.opacities.grad.any()
+    wants, pose = outputs_of(gaussians), torch.eye(4).requires_grad_()
+    near_plane = 0.0 if mean[2:] == [-3.0] else 0.25
+    camera = dataclasses.replace(pinhole(dtype=torch.float32), camera_to_world=pose, near_plane=near_plane)
+    output = render_gaussians(gaussians, camera, wants, TorchRendererSettings(background=BACKGROUND), renderer)
+    assert torch.equal(output.rgb, torch.tensor(BACKGROUND).expand(7, 9, 3))
+    assert output.splats.radii.shape == (len(gaussians),) and not output.splats.radii.any()
+    assert not any(output[name].any() for name in wants if name != "rgb")
+    sum(output[name].sum() for name in wants).backward()
+    for gradient in (*(getattr(gaussians, name).grad for name in INPUTS), pose.grad, output.splats.means2d.grad):
+        assert not gradient.any()
 
 
 @of_each

@@ -311,31 +311,6 @@ def test_distortion_of_close_discs_survives_float32():
 # --- culling and emptiness --------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("made", "mean", "scales", "opacity", "quat"),
-    [
-        *((make, [0, 0, depth], 0.3, 0.7, [1.0, 0, 0, 0]) for depth in (-3.0, 0.0, 0.1, 0.2)),
-        (make, [0, 0, 4.0], 0.3, 1 / 256, [1.0, 0, 0, 0]),
-        *((each, [], 0.3, 0.7, [1.0, 0, 0, 0]) for each in (make, make_surfels)),
-        *((make_surfels, [0, 0, depth], 0.3, 0.7, [1.0, 0, 0, 0]) for depth in (-3.0, 0.2)),
-        (make_surfels, [0, 0, 3.0], 0.3, 0.7, [0.5, 0.5, 0.5, 0.5]),  # exactly edge-on: its normal is the x axis
-        (make_surfels, [0, 0, 3.0], (0.3, 0.0), 0.7, [1.0, 0, 0, 0]),
-        (make_surfels, [90.0, 0, 3.0], 0.3, 0.7, [1.0, 0, 0, 0]),
-    ],
-)
-def test_what_is_not_drawn_gets_no_gradient(made, mean, scales, opacity, quat):
-    gaussians = cast(made(mean, scales, opacity, quats=torch.tensor([quat]).expand(len(mean) // 3, 4)), grad=True)
-    wants, pose = outputs_of(gaussians), torch.eye(4, dtype=torch.float64).requires_grad_()
-    camera = dataclasses.replace(pinhole(), camera_to_world=pose)
-    output = render_gaussians(gaussians, camera, wants, TorchRendererSettings(background=BACKGROUND))
-    assert torch.equal(output.rgb, torch.tensor(BACKGROUND, dtype=torch.float64).expand(7, 9, 3))
-    assert output.splats.radii.shape == (len(gaussians),) and not output.splats.radii.any()
-    assert not any(output[name].any() for name in wants if name != "rgb")
-    sum(output[name].sum() for name in wants).backward()
-    for gradient in (*(getattr(gaussians, name).grad for name in INPUTS), pose.grad, output.splats.means2d.grad):
-        assert not gradient.any()
-
-
 @of_each
 def test_the_near_plane_is_the_cameras(primitive):
     gaussians, camera = scene_of_gaussians("around the camera")

@@ -98,41 +98,39 @@ def moved(gaussians, transform, quat):
     )
 
 
+#: Options of :func:`random_gaussians` and of :func:`pinhole` by the name of a scene.
+_SCENES = {
+    "random": ({"n": 120}, {}),
+    "needles": ({"n": 80, "seed": 1}, {}),
+    "pancakes": ({"n": 80, "seed": 2}, {}),
+    "around the camera": ({"n": 150, "seed": 3, "depth": (-2.0, 1.5), "scale": (0.005, 0.2), "spread": 1.5}, {}),
+    "crowd in one tile": (
+        {"n": 400, "seed": 4, "depth": (2.0, 3.0), "scale": (0.01, 0.05), "opacity": (0.004, 0.08), "spread": 0.05},
+        {"width": 12, "height": 11, "cx": None, "cy": None},
+    ),
+    "opaque": ({"n": 150, "seed": 5, "scale": (0.1, 0.6), "opacity": (0.9, 1.0)}, {}),
+    "one pixel wide": ({"n": 60, "seed": 6}, {"width": 1, "height": 23, "cx": None, "cy": None}),
+    "one pixel": ({"n": 60, "seed": 6}, {"width": 1, "height": 1, "cx": None, "cy": None}),
+    # The axis misses the image.
+    "off centre": (
+        {"n": 120, "seed": 7, "spread": 1.5},
+        {"width": 33, "height": 21, "fx": 12.0, "fy": 30.0, "cx": -6.5, "cy": 30.25},
+    ),
+}
+SCENES = tuple(_SCENES)
+#: Scales of Gaussians of extreme shapes, but for a factor of 0.5 to 0.8.
+_SHAPES = {"needles": [2.0, 0.002, 0.002], "pancakes": [0.4, 0.3, 1e-5]}
+
+
 def scene(name):
     """A camera and Gaussians, both in a moved world frame, float64."""
-    camera = pinhole(37, 26, 31.0, 27.0, 16.3, 14.9)
-    if name == "random":
-        gaussians = random_gaussians(120)
-    elif name == "needles":
-        gaussians = random_gaussians(80, 1)
-        longest = torch.tensor([2.0, 0.002, 0.002], dtype=torch.float64)
-        gaussians = dataclasses.replace(gaussians, scales=longest * (0.5 + gaussians.scales))
-    elif name == "pancakes":
-        gaussians = random_gaussians(80, 2)
-        flat = torch.tensor([0.4, 0.3, 1e-5], dtype=torch.float64)
-        gaussians = dataclasses.replace(gaussians, scales=flat * (0.5 + gaussians.scales))
-    elif name == "around the camera":
-        gaussians = random_gaussians(150, 3, depth=(-2.0, 1.5), scale=(0.005, 0.2), spread=1.5)
-    elif name == "crowd in one tile":
-        gaussians = random_gaussians(400, 4, depth=(2.0, 3.0), scale=(0.01, 0.05), opacity=(0.004, 0.08), spread=0.05)
-        camera = pinhole(12, 11, 31.0, 27.0)
-    elif name == "opaque":
-        gaussians = random_gaussians(150, 5, scale=(0.1, 0.6), opacity=(0.9, 1.0))
-    elif name == "one pixel wide":
-        gaussians, camera = random_gaussians(60, 6), pinhole(1, 23, 31.0, 27.0)
-    elif name == "one pixel":
-        gaussians, camera = random_gaussians(60, 6), pinhole(1, 1, 31.0, 27.0)
-    elif name == "off centre":
-        gaussians = random_gaussians(120, 7, spread=1.5)
-        camera = pinhole(33, 21, 12.0, 30.0, -6.5, 30.25)  # the axis misses the image
-    transform, quat = rigid(11)
+    options, view = _SCENES[name]
+    gaussians, (transform, quat) = random_gaussians(**options), rigid(11)
+    if name in _SHAPES:
+        scales = torch.tensor(_SHAPES[name], dtype=torch.float64) * (0.5 + gaussians.scales)
+        gaussians = dataclasses.replace(gaussians, scales=scales)
+    camera = pinhole(**{"width": 37, "height": 26, "fx": 31.0, "fy": 27.0, "cx": 16.3, "cy": 14.9, **view})
     return moved(gaussians, transform, quat), dataclasses.replace(camera, camera_to_world=transform)
-
-
-SCENES = (
-    *("random", "needles", "pancakes", "around the camera", "crowd in one tile"),
-    *("opaque", "one pixel wide", "one pixel", "off centre"),
-)
 
 
 # --- closed forms -----------------------------------------------------------------------------------------------------
