@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from pathlib import Path
 
 import numpy as np
@@ -187,21 +186,19 @@ def test_mistakes_are_named(method_file, text, parts):
 
 
 @pytest.mark.parametrize(
-    ("key", "values", "end", "start"),
+    ("key", "values"),
     [
-        ("losses.depth.final_weight", "final_weight 0.0 with weight 0.2", "final_weight", "weight"),
-        ("losses.depth.weight", "final_weight 0.01 with weight 0.0", "final_weight", "weight"),
-        ("optimizers.offsets.final_lr", "final_lr 0.0 with lr 0.01", "final_lr", "lr"),
-        ("optimizers.offsets.lr", "final_lr 0.0001 with lr 0.0", "final_lr", "lr"),
+        ("losses.depth.final_weight", r"final_weight 0\.0 with weight 0\.2"),
+        ("losses.depth.weight", r"final_weight 0\.01 with weight 0\.0"),
+        ("optimizers.offsets.final_lr", r"final_lr 0\.0 with lr 0\.01"),
+        ("optimizers.offsets.lr", r"final_lr 0\.0001 with lr 0\.0"),
     ],
 )
-def test_a_schedule_with_an_end_at_zero_is_refused_in_one_line(key, values, end, start):
+def test_a_schedule_with_an_end_at_zero_is_refused_at_the_key_to_blame(key, values):
     """A rate or weight would be 0 for the whole run."""
-    message = (
-        f"`{key}=0`: {key}: {values}: a logarithmic schedule cannot reach or leave 0; give "
-        f"both above 0, or leave {end} out (null) for a constant {start}."
-    )
-    with pytest.raises(InputError, match=f"^{re.escape(message)}$"):
+    with pytest.raises(
+        InputError, match=rf"^`{key}=0`: {key}: {values}: a logarithmic schedule cannot reach or leave 0"
+    ):
         load_method("coliags", [f"{key}=0"])
 
 
