@@ -24,7 +24,16 @@ from coliags_plugin.core.jobs import Progress
 from coliags_plugin.core.ply import point_properties, write_ply
 from coliags_plugin.geometry.poses.alignment import umeyama
 from coliags_plugin.geometry.poses.trajectory import rigid
-from coliags_plugin.phantom.colon import ColonSurface, WallMotion, build_surface, frame_times, grow_anatomy, wall_motion
+from coliags_plugin.phantom.colon import (
+    ColonSurface,
+    WallMotion,
+    build_surface,
+    frame_times,
+    grow_anatomy,
+    nearest_poses_first,
+    seen_from,
+    wall_motion,
+)
 from coliags_plugin.phantom.imaging import (
     KNEE,
     Exposure,
@@ -43,7 +52,6 @@ from coliags_plugin.phantom.mucosa import Mucosa, paint_mucosa
 from coliags_plugin.phantom.props import bodies_at, wet_lens
 from coliags_plugin.phantom.settings import SAME_COLORS, PhantomSettings
 from coliags_plugin.phantom.streams import Purpose, slow_drift, stream
-from coliags_plugin.phantom.tracing import nearest_poses_first, seen_from
 from coliags_plugin.phantom.trajectory import RotationView, camera_path, poses_during, turn_away
 
 _LOG = logging.getLogger(__name__)

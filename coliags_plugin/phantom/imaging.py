@@ -11,13 +11,12 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from coliags_plugin.geometry.lenses.models import Lens
-from coliags_plugin.phantom.colon import ColonSurface
+from coliags_plugin.phantom.colon import ColonSurface, Hits, rotated
 from coliags_plugin.phantom.light import CameraLight, IndirectLight
 from coliags_plugin.phantom.mucosa import Mucosa
 from coliags_plugin.phantom.props import Body
 from coliags_plugin.phantom.settings import SAME_COLORS, PhantomSettings
 from coliags_plugin.phantom.streams import Purpose, slow_drift, smoothstep, stream
-from coliags_plugin.phantom.tracing import Hits, rotated
 
 #: Samples shaded per batch, which bounds memory and fits the cache.
 _CHUNK = 1 << 15

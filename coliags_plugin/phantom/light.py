@@ -17,10 +17,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from coliags_plugin.phantom.colon import RADIUS, ColonSurface, around_the_colon
+from coliags_plugin.phantom.colon import RADIUS, ColonSurface, Tracer, around_the_colon
 from coliags_plugin.phantom.settings import PhantomSettings, SpreadLaw
 from coliags_plugin.phantom.streams import smoothstep
-from coliags_plugin.phantom.tracing import Tracer
 
 #: Distance at which radiance is 1, mm.
 UNIT_DISTANCE = 20.0

@@ -13,11 +13,10 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from coliags_plugin.phantom.colon import ColonSurface, around_the_colon, grid_triangles, unit
+from coliags_plugin.phantom.colon import ColonSurface, Tracer, around_the_colon, grid_triangles, rotated, unit
 from coliags_plugin.phantom.light import CameraLight
 from coliags_plugin.phantom.settings import PhantomSettings
 from coliags_plugin.phantom.streams import Purpose, stream
-from coliags_plugin.phantom.tracing import Tracer, rotated
 
 #: Absorption by fluid per mm, RGB, and the colour that it scatters.
 _FLUID_ABSORPTION, _FLUID_ALBEDO = np.array([0.06, 0.09, 0.3]), np.array([0.62, 0.44, 0.14])

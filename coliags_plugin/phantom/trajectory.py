@@ -19,10 +19,9 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.geometry.poses.trajectory import rigid
-from coliags_plugin.phantom.colon import CentreLine, WallMotion, frame_times
+from coliags_plugin.phantom.colon import CentreLine, Tracer, WallMotion, frame_times
 from coliags_plugin.phantom.settings import PhantomSettings
 from coliags_plugin.phantom.streams import GOLDEN_ANGLE, Purpose, quintic, stream
-from coliags_plugin.phantom.tracing import Tracer
 
 #: No closer to the wall than this, mm; C3VD's nearest surface of any sequence is 5.9 mm away.
 NEAREST = 6.0

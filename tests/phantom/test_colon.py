@@ -15,12 +15,11 @@ import pytest
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.geometry.lenses.models import PinholeLens
 from coliags_plugin.phantom import trajectory
-from coliags_plugin.phantom.colon import build_surface, grow_anatomy
+from coliags_plugin.phantom.colon import Tracer, build_surface, grow_anatomy, nearest_poses_first, seen_from
 from coliags_plugin.phantom.generate import generate
 from coliags_plugin.phantom.mucosa import paint_mucosa
 from coliags_plugin.phantom.settings import PRESETS, PhantomSettings
 from coliags_plugin.phantom.streams import Purpose, SolidNoise, stream
-from coliags_plugin.phantom.tracing import Tracer, nearest_poses_first, seen_from
 from coliags_plugin.phantom.trajectory import APPROACHES, NEAREST, camera_path, turn_away
 from tests.phantom.test_light import plane_at
 

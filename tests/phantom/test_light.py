@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from coliags_plugin.geometry.lenses.models import PinholeLens
-from coliags_plugin.phantom.colon import ColonSurface, surface_of
+from coliags_plugin.phantom.colon import ColonSurface, Tracer, surface_of
 from coliags_plugin.phantom.generate import displaced, estimated_depth, generate, pose_errors, prepare
 from coliags_plugin.phantom.imaging import (
     Sensor,
@@ -33,7 +33,6 @@ from coliags_plugin.phantom.light import UNIT_DISTANCE, CameraLight, form_factor
 from coliags_plugin.phantom.mucosa import Mucosa
 from coliags_plugin.phantom.settings import PhantomSettings
 from coliags_plugin.phantom.streams import Purpose, stream
-from coliags_plugin.phantom.tracing import Tracer
 from tests.phantom.phantom_layouts import TINY
 from tests.phantom.test_phantom import digest
 
