@@ -159,7 +159,7 @@ def _prior(folder: Path) -> None:
     frames = [Frame.of(f"{index:04d}", index, torch.zeros(51, 64, 3, dtype=torch.uint8), camera) for index in range(3)]
     log_depth, weight = np.full((51, 64), np.log(30.0), np.float32), np.ones((51, 64), np.float32)
     for part in ("npy", "png"):
-        prior = FilePrior.of(folder / part, frames)
+        prior = FilePrior(folder / part, frames)
         for frame in frames:
             assert np.isfinite(prior.log_depth(frame, np.ones((51, 64), bool), log_depth, weight, 30.0)).all()
 

@@ -47,8 +47,7 @@ TRACKED = SfmSettings(camera=CameraSettings(model="PINHOLE", params=INTRINSICS),
 def test_a_model_is_weak_where_few_points_are_common_or_sides_have_another_scale():
     (link,) = weak_links(seen_points()[0])
     assert (link.after, link.points) == (GAP, COMMON) and link.log_scale == pytest.approx(0.0, abs=1e-6)
-    assert link.holds
-    assert f"{COMMON} points seen from both sides" in link.reason
+    assert link.holds and f"{COMMON} points seen from both sides" in link.reason
     links = {link.after: link for link in weak_links(seen_points(shift=25.0)[0])}
     assert links[GAP].log_scale > 0.3 and not links[GAP].holds
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -234,14 +234,12 @@ _FEWEST = 50
 
 
 class FilePrior:
-    """Depth maps from files, scale and shift fitted to each frame's known depth, as depth or as inverse depth."""
+    """Depth maps from files, scale and shift fitted to each frame's known depth, as depth or as inverse depth.
 
-    def __init__(self, files: Mapping[str, Path]) -> None:
-        self.files = dict(files)
+    The folder has one map of each frame, named as the frame, of its aspect ratio.
+    """
 
-    @classmethod
-    def of(cls, folder: Path, frames: Sequence[Frame]) -> FilePrior:
-        """The prior of a folder with one map of each frame, named as the frame, of its aspect ratio."""
+    def __init__(self, folder: Path, frames: Sequence[Frame]) -> None:
         if not folder.is_dir():
             raise InputError(f"`prior={folder}`: no such folder", "a folder of depth maps named as the images")
         files = {path.stem: path for path in files_in(folder, _SUFFIXES)}
@@ -252,10 +250,9 @@ class FilePrior:
                 f"NAME{', NAME'.join(_SUFFIXES)} for every frame",
                 "Name the maps as the images",
             )
-        prior = cls({frame.name: files[frame.name] for frame in frames})
+        self.files = {frame.name: files[frame.name] for frame in frames}
         for frame in frames:
-            prior._read(frame)
-        return prior
+            self._read(frame)
 
     def described(self) -> str:
         """Hash of the maps' names and contents."""

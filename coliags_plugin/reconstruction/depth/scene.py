@@ -20,7 +20,7 @@ from coliags_plugin.datamanagers.nerfstudio import EstimatedSceneWriter
 from coliags_plugin.datamanagers.shots import PAPER_SIZE, fitted
 from coliags_plugin.reconstruction.depth.estimate import Estimation, check_video, work_folder
 from coliags_plugin.reconstruction.depth.priors import DepthRange, FilePrior, LightPrior, find_range
-from coliags_plugin.reconstruction.depth.sweeping import DepthEstimationSettings, Map, Mask
+from coliags_plugin.reconstruction.depth.sweeping import DepthEstimationSettings, Map
 from coliags_plugin.reconstruction.structure.features import Pose, image_and_mask
 
 log = logging.getLogger(__name__)
@@ -61,7 +61,7 @@ def estimate_scene(
     check_video(frames, sources)
     if near_far is not None and not 0.0 < near_far[0] < near_far[1]:
         raise InputError(f"`near={near_far[0]:g}` and `far={near_far[1]:g}`", "0 < near < far")
-    depth_prior = LightPrior() if prior is None else FilePrior.of(prior, frames)
+    depth_prior = LightPrior() if prior is None else FilePrior(prior, frames)
     described = {
         "version": _VERSION,
         "data": scene.provenance.fingerprint,
@@ -162,7 +162,11 @@ class VoxelPoints:
 
     def add(self, pose: Pose, depth: Map, confidence: Map, image: UInt8[np.ndarray, "H W 3"]) -> None:
         """Add a frame's pixels of z-depth with a confidence of at least ``LEAST_CONFIDENCE``."""
-        chosen = (confidence >= LEAST_CONFIDENCE) & ~_steep(depth)
+        # Not at a depth discontinuity: a tenth or more between the neighbours on both sides.
+        log_depth, steep = np.log(depth), np.zeros(depth.shape, bool)
+        steep[1:-1] |= np.abs(log_depth[2:] - log_depth[:-2]) > 0.1
+        steep[:, 1:-1] |= np.abs(log_depth[:, 2:] - log_depth[:, :-2]) > 0.1
+        chosen = (confidence >= LEAST_CONFIDENCE) & ~steep
         weight = confidence[chosen].astype(np.float64)[:, None]
         local = (pose.rays() * depth[..., None])[chosen]
         offset = local @ pose.camera_to_world[:3, :3].T + pose.camera_to_world[:3, 3] - self.origin
@@ -185,12 +189,3 @@ class VoxelPoints:
         weight = sums[:, :1]
         positions = sums[:, 1:4] / weight + self.origin
         return positions.astype(np.float32), np.rint(sums[:, 4:7] / weight).astype(np.uint8)
-
-
-def _steep(depth: Map) -> Mask:
-    """Pixels at a depth discontinuity: a tenth or more between the neighbours on both sides."""
-    log = np.log(depth)
-    steep = np.zeros(depth.shape, bool)
-    steep[1:-1] |= np.abs(log[2:] - log[:-2]) > 0.1
-    steep[:, 1:-1] |= np.abs(log[:, 2:] - log[:, :-2]) > 0.1
-    return steep

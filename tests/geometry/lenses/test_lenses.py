@@ -139,8 +139,7 @@ def test_negligible_terms_change_nothing():
 def test_undistortion_map_marks_what_the_lens_does_not_reach():
     columns, rows = undistortion_map(FISHEYE, replace(FISHEYE.resized(135, 108).pinhole, fx=6.0, fy=6.0))
     assert columns.dtype == rows.dtype == np.float32 and columns[0, 0] == NOWHERE
-    assert np.isfinite(columns).all()
-    assert np.isfinite(rows).all()
+    assert np.isfinite(columns).all() and np.isfinite(rows).all()
 
 
 def test_octagon_is_symmetric_and_scales():

@@ -152,8 +152,7 @@ def test_a_phantom_whose_flags_of_another_mesh_are_refused(tmp_path):
     assert find_true_surface(tmp_path) == tmp_path / "truth/mesh.ply"
     for path in (tmp_path, tmp_path / "truth/mesh.ply"):
         surface = read_true_surface(path)
-        assert surface.seen.tolist() == [False, True]
-        assert "training" in surface.seen_by
+        assert surface.seen.tolist() == [False, True] and "training" in surface.seen_by
     for flags, message in (
         ({"face_seen": np.ones(3, bool)}, "one bool for each of 2 triangles"),
         ({"other": np.ones(2, bool)}, "face_seen"),
@@ -168,8 +167,7 @@ def test_a_phantom_whose_flags_of_another_mesh_are_refused(tmp_path):
 def test_c3vd_and_faces_of_any_form(tmp_path, faces):
     (tmp_path / "coverage_mesh.obj").write_text(SQUARE + faces)
     surface = read_true_surface(tmp_path)
-    assert surface.seen.tolist() == [True, False]
-    assert "vt 1" in surface.seen_by
+    assert surface.seen.tolist() == [True, False] and "vt 1" in surface.seen_by
     assert np.array_equal(surface.mesh.triangles, squares(1).triangles)
 
 

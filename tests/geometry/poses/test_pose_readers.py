@@ -196,8 +196,7 @@ KEYS = {"fl_x": 100.0, "fl_y": 90.0, "cx": 31.0, "cy": 25.0, "w": 64, "h": 48}
 def test_intrinsics(tmp_path, content, frame, expected, remark):
     read = nerfstudio.read(transforms(tmp_path / "t.json", [some_transform(0)] * 2, frame=frame, **content))
     if expected is None:
-        assert read.intrinsics is None
-        assert remark in read.remarks[-1]
+        assert read.intrinsics is None and remark in read.remarks[-1]
     else:
         np.testing.assert_allclose(astuple(read.intrinsics), expected)
         assert not read.remarks
@@ -352,8 +351,7 @@ def test_common_pinholes(tmp_path, cameras, remark):
     if remark is None:
         assert read.intrinsics.fy == 71.0
     else:
-        assert read.intrinsics is None
-        assert remark in read.remarks[0]
+        assert read.intrinsics is None and remark in read.remarks[0]
 
 
 PARAMS = {

@@ -176,8 +176,7 @@ def test_the_rim_is_the_near_side_of_an_edge():
 def test_confidence_rises_with_support_and_falls_at_edges():
     flat = np.full((80, 96), 3.0, np.float32)
     levels = [depth_confidence(flat, n * FLOAT, 0.01 * FLOAT, ~ALL)[40, 40] for n in (0.0, 0.3, 1.0, 3.0, 9.0)]
-    assert levels[0] == 0.0
-    assert (np.diff(levels) > 0.0).all()
+    assert levels[0] == 0.0 and (np.diff(levels) > 0.0).all()
     assert levels[-1] < 1.0
     edge = flat.copy()
     edge[:, 48:] = 3.4
@@ -214,7 +213,7 @@ def test_files_as_a_prior_in_any_scale_and_shift(tmp_path, inverse, suffix):
         write_image(tmp_path / "lit.png", np.rint(values).astype(np.uint16))
     half = FLOAT.copy()
     half[:, 48:] = 0.0
-    prior = FilePrior.of(tmp_path, [frame])
+    prior = FilePrior(tmp_path, [frame])
     fitted = np.exp(prior.log_depth(frame, ALL, np.log(depth).astype(np.float32), half, 40.0))
     np.testing.assert_allclose(fitted, depth, rtol=2e-3)
     # Without known depth the scale is a guess.
@@ -222,16 +221,16 @@ def test_files_as_a_prior_in_any_scale_and_shift(tmp_path, inverse, suffix):
     assert np.median(guess) == pytest.approx(40.0, rel=1e-3)
     if suffix == "npy":  # a larger map of the same aspect is taken
         np.save(tmp_path / "lit.npy", np.kron(values, np.ones((2, 2))))
-        fitted = FilePrior.of(tmp_path, [frame]).log_depth(frame, ALL, np.log(depth).astype(np.float32), FLOAT, 40.0)
+        fitted = FilePrior(tmp_path, [frame]).log_depth(frame, ALL, np.log(depth).astype(np.float32), FLOAT, 40.0)
         np.testing.assert_allclose(np.exp(fitted), depth, rtol=1e-3)
 
 
 def test_files_that_do_not_fit_are_refused(tmp_path):
     frame, depth = lit_frame()
-    refuses("no such folder", FilePrior.of, tmp_path / "none", [frame])
-    refuses("1 of 1 frames have no depth map: lit", FilePrior.of, tmp_path, [frame])
+    refuses("no such folder", FilePrior, tmp_path / "none", [frame])
+    refuses("1 of 1 frames have no depth map: lit", FilePrior, tmp_path, [frame])
     np.save(tmp_path / "lit.npy", depth[:, :60])
-    refuses("60 x 80 pixels, frame lit 96 x 80", FilePrior.of, tmp_path, [frame])
+    refuses("60 x 80 pixels, frame lit 96 x 80", FilePrior, tmp_path, [frame])
 
 
 def test_a_point_unlike_its_neighbours_stands_out_and_an_edge_does_not():
