@@ -53,10 +53,6 @@ class ComparisonFolder:
             self.read_results()
             yield
 
-    def plan(self) -> ComparisonPlan:
-        """Plan of all that was asked for so far; empty where nothing was."""
-        return read_plan(self.path) or ComparisonPlan()
-
     def _check_kind(self) -> None:
         """Refuse a folder that holds something else than comparisons."""
         if self.path.exists() and not self.path.is_dir():
@@ -140,9 +136,9 @@ class ComparisonFolder:
         """The result of a cell; under another name where another method is the same; None where it is not done."""
         if cell.fingerprint is None:
             return None
-        key, own = cell.planned.key, self._results.get(self.path / cell.planned.result)
-        if own is not None and own.key == key:
-            return own
+        key, result = cell.planned.key, self._results.get(self.path / cell.planned.result)
+        if result is not None and result.key == key:
+            return result
         return next((result for result in self._results.values() if result.key == key), None)
 
     def add(self, cell: ComparisonCell, result: Result) -> None:

@@ -15,7 +15,7 @@ import pytest
 from coliags_plugin.comparison.compare import plan_cells
 from coliags_plugin.comparison.folder import ComparisonFolder
 from coliags_plugin.comparison.named_files import Variant
-from coliags_plugin.comparison.plan import make_cells
+from coliags_plugin.comparison.plan import make_cells, read_plan
 from coliags_plugin.comparison.scenes import SceneSource
 from coliags_plugin.config.options import CompareOptions
 from coliags_plugin.core.errors import InputError, InterruptedRunError
@@ -112,7 +112,7 @@ def test_a_comparison_is_extended(wall, folder):
     assert ran == ["wall scaffold-gs seed 1", "wall coliags seed 1"]
     _, ran = again(wall, folder, ["scaffold-gs"], splits=["block"])
     assert ran == ["wall-block scaffold-gs seed 0"]
-    cells = ComparisonFolder(folder).plan().cells
+    cells = read_plan(folder).cells
     assert len(cells) == len({cell.key for cell in cells}) == 5
     assert read_result(folder / cells[-1].result).scene.split == "block"
 
@@ -126,7 +126,7 @@ def test_a_method_that_has_changed_is_another_run(wall, folder, tmp_path, caplog
     _, ran = again(wall, folder, [str(mine)])
     assert ran == ["wall mine seed 0"] and "not those of the former plan" in caplog.text
     assert len(list((folder / "results" / "wall" / "mine").iterdir())) == 2
-    assert sum(cell.method == "mine" for cell in ComparisonFolder(folder).plan().cells) == 1
+    assert sum(cell.method == "mine" for cell in read_plan(folder).cells) == 1
 
 
 def test_methods_that_are_the_same_are_run_once(wall, tmp_path):
@@ -424,7 +424,7 @@ def test_a_decision_is_recorded_when_the_plan_is_first_written(wall, tmp_path):
     folder.check_extends(first)
     folder.path.mkdir()
     folder.record(first, cells(wall))
-    decided = folder.plan().decided
+    decided = read_plan(folder.path).decided
     assert (decided.reference, decided.primary) == ("coliags", ("psnr", "depth_mse_inner"))
     assert decided.date == datetime.now(timezone.utc).date().isoformat()
     folder.check_extends(first)
@@ -433,11 +433,11 @@ def test_a_decision_is_recorded_when_the_plan_is_first_written(wall, tmp_path):
     more, both = chosen(wall), cells(wall, ["coliags", "3dgs"])
     folder.check_extends(more)
     folder.record(more, both)
-    assert folder.plan().decided is not None
-    assert [cell.method for cell in folder.plan().cells] == ["coliags", "3dgs"]
+    assert read_plan(folder.path).decided is not None
+    assert [cell.method for cell in read_plan(folder.path).cells] == ["coliags", "3dgs"]
     changed = cells(wall, [Variant("coliags", "coliags", ("field.features=8",))])
     folder.record(first, changed)
-    assert folder.plan().cells[0].key == changed[0].planned.key
+    assert read_plan(folder.path).cells[0].key == changed[0].planned.key
     (tmp_path / "late" / "results").mkdir(parents=True)
     late = ComparisonFolder(tmp_path / "late")
     for _ in range(2):  # results alone, and a plan
