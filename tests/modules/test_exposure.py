@@ -81,9 +81,7 @@ def test_views_beside_the_video_have_the_gain_of_the_nearest_training_camera():
 
 
 def test_gains_stay_within_their_bounds_and_frames_at_a_bound_are_named():
-    module = make(max_gain=2.0)
-    with torch.no_grad():
-        module.log_gain[3] = 70.0
+    module = make((0.0, 0.0, 0.0, 70.0, 0.0, 0.0, 0.0), max_gain=2.0)
     gains = module.log_gains().exp()
     assert gains.max().item() == pytest.approx(2.0) and gains.min().item() == pytest.approx(0.5)
     assert "0004" in module.learned["at_bound"] and module.learned["gains"]["0004"] == pytest.approx([2.0])
@@ -220,8 +218,11 @@ def test_views_are_interpolated_in_short_videos_and_until_all_training_frames_we
 # The response curve: increasing, the identity below its knee, and of known values and gradients
 
 
-def make_response(**options):
-    return CameraResponse(ResponseSettings(**options), wall_scene())
+def make_response(*log_slopes, **options):
+    module = CameraResponse(ResponseSettings(segments=len(log_slopes) or 8, **options), wall_scene())
+    if log_slopes:
+        module.log_slope.data.copy_(torch.tensor(log_slopes))
+    return module
 
 
 def test_it_begins_as_the_identity_for_every_view_and_colours_that_are_not_finite_stay_so():
@@ -233,9 +234,7 @@ def test_it_begins_as_the_identity_for_every_view_and_colours_that_are_not_finit
 
 
 def test_it_is_numpys_interpolation_of_its_points():
-    module = make_response(knee=0.4, segments=5)
-    with torch.no_grad():
-        module.log_slope.copy_(torch.tensor([0.3, -1.0, -3.0, 1.0, -0.5]))
+    module = make_response(0.3, -1.0, -3.0, 1.0, -0.5, knee=0.4)
     colors, values = module.learned["colors"], module.learned["values"]
     assert (colors[0], values[0], colors[-1]) == pytest.approx((0.4, 0.4, 1.5))
     calls = torch.linspace(0.0, 1.5, 301)
@@ -245,9 +244,7 @@ def test_it_is_numpys_interpolation_of_its_points():
 
 
 def test_the_curve_of_a_device_is_that_of_the_cpu():
-    module = make_response(knee=0.4, segments=5)
-    with torch.no_grad():
-        module.log_slope.copy_(torch.tensor([0.3, -1.0, -3.0, 1.0, -0.5]))
+    module = make_response(0.3, -1.0, -3.0, 1.0, -0.5, knee=0.4)
     colors, weights = torch.linspace(-0.1, 2.0, 200), torch.rand(200)
     results = []
     for device in ("cpu", "cuda"):
@@ -263,17 +260,12 @@ def test_the_curve_of_a_device_is_that_of_the_cpu():
 
 @given(st.lists(st.floats(-50.0, 50.0), min_size=3, max_size=3), st.floats(0.0, 3.0), st.floats(1e-3, 3.0))
 def test_it_increases(slopes, color, more):
-    module = CameraResponse(ResponseSettings(segments=3), wall_scene())
-    with torch.no_grad():
-        module.log_slope.copy_(torch.tensor(slopes))
-    below, above = module.curve(torch.tensor([color, color + more], dtype=torch.float64)).tolist()
+    below, above = make_response(*slopes).curve(torch.tensor([color, color + more], dtype=torch.float64)).tolist()
     assert above - below >= 0.019 * more
 
 
 def test_its_gradient_is_that_of_differences():
-    module = make_response(segments=3).double()
-    with torch.no_grad():
-        module.log_slope.copy_(torch.tensor([-0.5, 0.2, -1.0]))
+    module = make_response(-0.5, 0.2, -1.0).double()
     colors = torch.tensor([0.2, 0.6, 0.9, 1.3, 1.7], dtype=torch.float64, requires_grad=True)
     module.forward = module.curve
 
