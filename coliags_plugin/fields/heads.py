@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from abc import abstractmethod
 from typing import ClassVar, Literal
 
 import torch
@@ -134,9 +133,9 @@ class MLPAppearanceHead(AppearanceHead[AppearanceT]):
         """Encoding of the viewing direction that the MLP gets."""
         return anchors.directions
 
-    @abstractmethod
     def inputs(self, anchors: SeenAnchors) -> Float[Tensor, "V R"]:
         """Inputs of the MLP besides the feature: the direction as encoded, then the distance if :attr:`knows_lamp`."""
+        return torch.cat([anchors.directions, anchors.distances], dim=1) if self.knows_lamp else anchors.directions
 
     @torch.no_grad()
     def prepare(self, scene: Scene, distances: Float[Tensor, "D"]) -> None:
@@ -181,12 +180,6 @@ class PlainAppearanceHead(MLPAppearanceHead[PlainAppearanceSettings]):
     def knows_lamp(self) -> bool:
         """True where the distance to the lamp is an input of the MLP."""
         return self.settings.distance
-
-    def inputs(self, anchors: SeenAnchors) -> Float[Tensor, "V R"]:
-        """v, and d if that is an input."""
-        return (
-            torch.cat([anchors.directions, anchors.distances], dim=1) if self.settings.distance else anchors.directions
-        )
 
 
 class IMIAAppearanceSettings(AppearanceSettings):
