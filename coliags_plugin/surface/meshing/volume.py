@@ -79,24 +79,10 @@ class Volume:
         return np.unique(np.concatenate(keys))
 
     def _add(self, view: DepthView) -> None:
-        camera, band = view.camera, self.truncation * self.voxel_size
+        camera, edge, band = view.camera, _BLOCK * self.voxel_size, self.truncation * self.voxel_size
         # From a step in z-depth to the distance along the normal.
         slant = incidence_cosines(view.depth.double(), camera).nan_to_num() * camera.rays().norm(dim=-1)
         depth, quality, slant = view.depth.flatten(), view.quality.flatten(), slant.float().flatten()
-        for voxels, z, pixels in self._projected(view):
-            distance = ((depth[pixels] - z) * slant[pixels] / band).clamp(max=1.0)
-            good = (quality[pixels] > 0) & (distance > -1.0)
-            squared = torch.where(good, quality[pixels] ** 2, 0.0)
-            self._distance[voxels] += squared**2 * distance
-            self._square[voxels] += squared**2 * distance**2
-            self._weight[voxels] += squared**2
-            near = good & (distance < 1.0)
-            self._support[voxels] += squared * near
-            self._seen[voxels] += near
-
-    def _projected(self, view: DepthView) -> Iterator[tuple[Int[Tensor, "N"], Float[Tensor, "N"], Int[Tensor, "N"]]]:
-        """Voxels inside an image, their z-depths and pixels, row by row; in parts. [N], [N], [N]"""
-        camera, edge, size = view.camera, _BLOCK * self.voxel_size, (view.camera.width, view.camera.height)
         turn = camera.camera_to_world[:3, :3]
         corners = (torch.from_numpy(self._blocks * edge) - camera.center) @ turn
         steps = (torch.from_numpy(_PLACES * self.voxel_size) @ turn).float()
@@ -104,9 +90,18 @@ class Volume:
         for part in torch.split(torch.nonzero(near)[:, 0], _AT_ONCE):
             x, y, z = (corners[part].float()[:, None] + steps).reshape(-1, 3).unbind(1)
             column, row = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
-            inside = (z > 0) & (column >= 0) & (column < size[0]) & (row >= 0) & (row < size[1])
+            inside = (z > 0) & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
             voxels = (part[:, None] * _VOXELS + torch.arange(_VOXELS)).flatten()[inside]
-            yield voxels, z[inside], row[inside].long() * size[0] + column[inside].long()
+            pixels = row[inside].long() * camera.width + column[inside].long()
+            distance = ((depth[pixels] - z[inside]) * slant[pixels] / band).clamp(max=1.0)
+            good = (quality[pixels] > 0) & (distance > -1.0)
+            squared = torch.where(good, quality[pixels] ** 2, 0.0)
+            self._distance[voxels] += squared**2 * distance
+            self._square[voxels] += squared**2 * distance**2
+            self._weight[voxels] += squared**2
+            shown = good & (distance < 1.0)
+            self._support[voxels] += squared * shown
+            self._seen[voxels] += shown
 
     def mesh(self, min_views: int, min_support: float, max_conflict: float = math.inf) -> TriangleMesh:
         """The zero level of the distance, where enough views show it and agree on it.
