@@ -15,11 +15,9 @@ def corners(image: Array, values: Array, start: int) -> None:
     Nothing is written for the last row and column.
     """
     height, width = image.shape
-    for y in range(height - 1):
-        for x in range(width - 1):
-            at = start + 4 * (y * width + x)
-            values[at], values[at + 1] = image[y, x], image[y, x + 1]
-            values[at + 2], values[at + 3] = image[y + 1, x], image[y + 1, x + 1]
+    table = values[start : start + 4 * image.size].reshape(height, width, 4)[:-1, :-1]
+    table[:, :, 0], table[:, :, 1] = image[:-1, :-1], image[:-1, 1:]
+    table[:, :, 2], table[:, :, 3] = image[1:, :-1], image[1:, 1:]
 
 
 @kernel
@@ -176,11 +174,9 @@ _MARGIN = vec.WIDTH
 def _framed(image: Array, radius: int, row: int) -> Array:
     """An image as a table with rows of ``row`` numbers and a border of zeros."""
     height, width = image.shape
-    framed = np.zeros((height + 2 * radius) * row, np.float32)
-    for y in range(height):
-        for x in range(width):
-            framed[(y + radius) * row + _MARGIN + x] = image[y, x]
-    return framed
+    framed = np.zeros((height + 2 * radius, row), np.float32)
+    framed[radius : radius + height, _MARGIN : _MARGIN + width] = image
+    return framed.reshape(framed.size)
 
 
 @part
@@ -360,10 +356,8 @@ def sweep(
             _correlate(guide, warped, visible, radius, row, floor, lines, scores, n * size)
         for at in range(0, size, vec.WIDTH):
             vec.store(costs, d * size + at, _mean_of_best(scores, count, size, at, counted_of, lowest))
-    for y in range(height):
-        for x in range(width):
-            for d in range(len(ratios)):
-                cost[y, x, d] = costs[d * size + y * wide + x]
+    for d in range(len(ratios)):
+        cost[:, :, d] = costs[d * size : (d + 1) * size].reshape(height, wide)[:, :width]
 
 
 @part
