@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from tests.fuzz.seeds import make_seeds
+from tests.fuzz.targets import make_seeds
 
 
 @pytest.fixture(scope="session")
