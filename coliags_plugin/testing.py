@@ -227,7 +227,6 @@ def _resized(camera: Camera) -> Camera:
 
 @torch.no_grad()
 def _maps(model: Model, camera: Camera, view: View | None, pixels: Tensor | None = None) -> dict[str, Tensor]:
-    """All outputs of a view by name."""
     output = model.render(camera, sorted(model.outputs), view, pixels)
     return {"rgb": output.rgb, "alpha": output.alpha, **output.maps}
 

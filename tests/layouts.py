@@ -150,7 +150,6 @@ def _write_params(path, trajectory, points):
 
 
 def _write_gaussians(path, positions, colors):
-    """Write isotropic Gaussians of equal size as a 3DGS PLY file of spherical-harmonics degree 0."""
     count = len(positions)
     properties = point_properties(positions)
     properties |= {f"n{name}": np.zeros(count) for name in "xyz"}

@@ -75,7 +75,6 @@ def check_installation(device: str = "auto") -> list[CheckResult]:
 
 
 def _cuda() -> str:
-    """Versions of CUDA or ROCm."""
     if not torch.cuda.is_available():
         raise CheckSkippedError(_NO_CUDA)
     built = f"CUDA {torch.version.cuda}" if torch.version.cuda else f"ROCm {torch.version.hip}"
@@ -88,7 +87,6 @@ def _cuda_device(index: int) -> str:
 
 
 def _library(name: str, module: str) -> str:
-    """Version of a library that loads."""
     try:
         installed = version(name)
         importlib.import_module(module)

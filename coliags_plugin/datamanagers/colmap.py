@@ -447,7 +447,6 @@ def _image_paths(folder: Path, model: SparseModel, outside: bool) -> list[Path]:
 
 
 def _masks(scene: Path, model: SparseModel) -> list[Path | None]:
-    """Mask files of any of the images."""
     folder = reading.one_folder(scene, reading.MASK_FOLDERS)
     if folder is None:
         return [None] * len(model.images)

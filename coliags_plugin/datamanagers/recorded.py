@@ -373,7 +373,6 @@ class RecordedDataManager(DataManager):
         return frames
 
     def _split(self, recording: Recording, path: Path) -> tuple[list[int], list[int]]:
-        """Indices of training frames and of test frames."""
         settings = self.settings
         indices = list(range(0, len(recording.shots), settings.frame_step))[: settings.max_frames]
         if settings.split == "own" and recording.own_split is None:

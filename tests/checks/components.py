@@ -138,7 +138,6 @@ class Division(Strategy):
 
 
 def changed(base, **attributes):
-    """A subclass with other attributes and methods."""
     return type(base.__name__, (base,), {"__module__": __name__, **attributes})
 
 

@@ -41,7 +41,6 @@ def scene(folder):
 
 
 def each(scene: Scene, change) -> Scene:
-    """The scene with every frame changed."""
     sets = {name: [change(frame.to("cpu")) for frame in frames] for name, frames in scene.test_sets.items()}
     return replace(scene, train=[change(frame.to("cpu")) for frame in scene.train], test_sets=sets)
 

@@ -19,7 +19,6 @@ needs_triton = pytest.mark.skipif(find_spec("triton") is None, reason="triton is
 
 @pytest.fixture
 def small(monkeypatch):
-    """Trials of a few Gaussians on few pixels."""
     monkeypatch.setattr(installation, "ACCURACY", (40, 24, 16))
     monkeypatch.setattr(installation, "SPEED", (20, 16, 8))
 

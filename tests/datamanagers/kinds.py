@@ -212,7 +212,6 @@ def repaint(pattern: str, place: int, change: Callable[[np.ndarray], np.ndarray]
 
 
 def change_exr(path: Path, change: Callable[[str, np.ndarray], tuple[str, np.ndarray]]) -> None:
-    """Change the names and pixels of an EXR file's channels."""
     with OpenEXR.File(str(path), separate_channels=True) as file:
         channels = {name: np.array(channel.pixels) for name, channel in file.parts[0].channels.items()}
     write_exr(path, dict(change(name, pixels) for name, pixels in channels.items()))
@@ -227,8 +226,6 @@ def three_channels(pixels: np.ndarray) -> np.ndarray:
 
 
 def cut(pattern: str, place: int = 0, share: float = 0.6) -> Spoil:
-    """Leave the first part of a file."""
-
     def spoil(folder: Path) -> None:
         path = files(folder, pattern)[place]
         data = path.read_bytes()
@@ -238,13 +235,10 @@ def cut(pattern: str, place: int = 0, share: float = 0.6) -> Spoil:
 
 
 def write(name: str, content: str | bytes) -> Spoil:
-    """Replace the content of a file."""
     return lambda folder: (folder / name).write_bytes(content if isinstance(content, bytes) else content.encode())
 
 
 def edit(name: str, old: str, new: str) -> Spoil:
-    """Replace what matches a pattern in a text file."""
-
     def spoil(folder: Path) -> None:
         text, count = re.subn(old, new, (folder / name).read_text())
         assert count > 0
@@ -254,7 +248,6 @@ def edit(name: str, old: str, new: str) -> Spoil:
 
 
 def copy(pattern: str, name: str) -> Spoil:
-    """Copy the first of some files within its folder."""
     return lambda folder: shutil.copy(path := files(folder, pattern)[0], path.with_name(name))
 
 
@@ -276,13 +269,11 @@ def remove(pattern: str, place: int | None = None) -> Spoil:
 
 
 def clear(folder: Path) -> None:
-    """Delete all there is."""
     for path in folder.iterdir():
         shutil.rmtree(path) if path.is_dir() else path.unlink()
 
 
 def change_lines(name: str, change: Callable[[list[str]], list[str]]) -> Spoil:
-    """Change the lines of a text file."""
     return lambda folder: (folder / name).write_text("\n".join(change((folder / name).read_text().splitlines())) + "\n")
 
 
@@ -319,8 +310,6 @@ def change_frames(pattern: str, change: Callable[[int, dict[str, Any]], Any]) ->
 
 
 def change_frame(pattern: str, place: int, change: Callable[[np.ndarray], Any]) -> Spoil:
-    """Change the matrix of a frame, in place."""
-
     def spoil(content: dict[str, Any]) -> None:
         matrix = np.array(content["frames"][place]["transform_matrix"])
         change(matrix)
@@ -330,8 +319,6 @@ def change_frame(pattern: str, place: int, change: Callable[[np.ndarray], Any]) 
 
 
 def change_npz(name: str, change: Callable[[dict[str, np.ndarray]], Any]) -> Spoil:
-    """Change the arrays of an NPZ file, in place."""
-
     def spoil(folder: Path) -> None:
         with np.load(folder / name) as file:
             arrays = dict(file)
@@ -342,8 +329,6 @@ def change_npz(name: str, change: Callable[[dict[str, np.ndarray]], Any]) -> Spo
 
 
 def change_model(change: Callable[[pycolmap.Reconstruction], pycolmap.Reconstruction | None]) -> Spoil:
-    """Change a COLMAP model, in place or by what is returned."""
-
     def spoil(folder: Path) -> None:
         model = pycolmap.Reconstruction(str(folder / "sparse/0"))
         (change(model) or model).write_binary(str(folder / "sparse/0"))
@@ -427,7 +412,6 @@ def one_pose(matrix: Callable[[np.ndarray], None], factor: float) -> Callable[[K
 
 
 def result(change: Callable[[dict[str, np.ndarray]], object]) -> Callable[[Kind], Spoil]:
-    """Change the arrays of EndoGSLAM's result."""
     return lambda kind: change_npz(kind.params, change)
 
 
@@ -436,7 +420,6 @@ def cameras(change: Callable[[pycolmap.Camera], object]) -> Callable[[pycolmap.R
 
 
 def unregistered(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
-    """A model of which no image was registered."""
     empty = pycolmap.Reconstruction()
     for camera in model.cameras.values():
         empty.add_camera_with_trivial_rig(camera)
@@ -452,7 +435,6 @@ def panoramic(_: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
 
 
 def with_intrinsics(text: str) -> Spoil:
-    """A camera of intrinsics.txt."""
     return lambda folder: [remove("camera.json")(folder), write("intrinsics.txt", text)(folder)]
 
 
@@ -467,7 +449,6 @@ def fourth_without(key: str) -> Callable[[int, dict], object]:
 
 
 def frame(place: int, pattern: str, **values: object) -> Spoil:
-    """Set keys of a frame."""
     return change_frames(pattern, lambda index, entry: entry.update(values) if index == place else None)
 
 

@@ -62,7 +62,6 @@ def wall(tmp_path_factory) -> Path:
 
 @pytest.fixture
 def mine(wall, tmp_path) -> Path:
-    """A copy to be spoilt."""
     return Path(shutil.copytree(wall, tmp_path / "wall"))
 
 

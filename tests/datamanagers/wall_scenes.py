@@ -69,7 +69,6 @@ def seen_from(frame: Frame, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def worst_off_wall(frame: Frame) -> float:
-    """Largest distance of a frame's depth from the wall, mm."""
     return off_wall(frame.camera.unproject(frame.depth).numpy()).max()
 
 
@@ -78,18 +77,15 @@ def names(frames: list[Frame]) -> list[str]:
 
 
 def manager(name: str, **options) -> RecordedDataManager:
-    """The data manager of a format."""
     kind = datamanagers.get(name)
     return kind(kind.Settings(**options))
 
 
 def load_scene(name: str, folder: Path, **options) -> Scene:
-    """The scene in a folder, by the data manager of a format."""
     return manager(name, **options).load(folder)
 
 
 def layout_of(name: str) -> Layout:
-    """The writer of a layout."""
     return phantom_layouts.get(name)()
 
 

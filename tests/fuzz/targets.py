@@ -101,7 +101,6 @@ def _write_rich_transforms(scene: Path, target: Path, surface: TriangleMesh) -> 
 
 
 def _write_trajectories(folder: Path, poses: np.ndarray) -> None:
-    """A trajectory in every format."""
     folder.mkdir()
     names = tuple(f"{index:04d}.png" for index in range(len(poses)))
     trajectory = Trajectory(poses, names, np.arange(len(poses)) / 30.0, Intrinsics(50.0, 50.0, 32.0, 25.5, 64, 51))
@@ -133,7 +132,6 @@ def _write_splats(folder: Path, scene: Path) -> None:
 
 
 def _write_runs(folder: Path) -> None:
-    """A run that can be resumed, and one with results."""
     target = folder / "run"
     target.mkdir()
     scene = target / "scene"
@@ -200,7 +198,6 @@ class Target:
 
 
 def _within(values: Any, most: float) -> bool:
-    """True if all are finite and within a bound."""
     return bool(np.all(np.abs(np.asarray(values, np.float64)) <= most))
 
 

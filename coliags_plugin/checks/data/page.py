@@ -161,7 +161,6 @@ def _pair_images(source: Frame, target: Frame, unit: str) -> model.Figures:
 
 
 def _checkered(shown: torch.Tensor) -> torch.Tensor:
-    """Checkerboard mask within the pixels shown. [H, W]"""
     height, width = shown.shape
     side = max(8, width // 10)
     rows, columns = torch.arange(height)[:, None] // side, torch.arange(width)[None] // side
