@@ -85,19 +85,24 @@ def load_poses(files: PreparedFiles, params: EndoGslamParams | None, source: Pos
         "pose_convention": None if file is None else {"order": file.convention, **file.evidence},
         "slam": None,
     }
-    if source == "slam" and params is None:
+    if params is None and source == "slam":
         raise InputError(
             f"{files.folder} has no {PARAMS}, in it or where PR-Endo's release has it",
             "EndoGSLAM's result, for option poses: slam",
             "Name it with `datamanager.params_file=FILE`, or `datamanager.poses=ground-truth`",
         )
-    if params is None:
-        if file is None:
-            raise _no_true_poses(files.folder, "")
-        return SequencePoses(file.camera_to_world, None, np.eye(4), {**facts, "world": "pose.txt"})
-    indices, from_true, facts["slam"] = _align_slam(files, params, file)
+    indices = np.zeros(0, np.int64)
+    if params is not None:
+        indices, from_true, facts["slam"] = _align_slam(files, params, file)
     if file is None and len(indices) != count:
-        raise _no_true_poses(files.folder, f", and {files.params} poses of {len(indices)} of {count} images alone")
+        raise InputError(
+            f"{files.folder} has no pose.txt, and its {PARAMS} poses of {len(indices)} of {count} images",
+            "a pose for every image",
+            "Put the sequence's pose.txt of C3VD's release there",
+        )
+    if params is None:
+        assert file is not None  # as there are poses
+        return SequencePoses(file.camera_to_world, None, np.eye(4), {**facts, "world": "pose.txt"})
     # The true poses of params.npz are relative to the first camera.
     first = np.eye(4) if file is None else file.camera_to_world[0]
     from_file = None if file is None else from_true @ _inverse(first)
@@ -112,14 +117,6 @@ def load_poses(files: PreparedFiles, params: EndoGslamParams | None, source: Pos
         camera_to_world = from_file @ file.camera_to_world
         camera_to_world[indices] = params.camera_to_world
     return SequencePoses(camera_to_world, np.eye(4), from_file, {**facts, "world": "first camera, as mapped"})
-
-
-def _no_true_poses(folder: Path, instead: str) -> InputError:
-    return InputError(
-        f"{folder} has no pose.txt{instead}",
-        "a pose for every image",
-        "Put the sequence's pose.txt of C3VD's release there",
-    )
 
 
 def _align_slam(
@@ -144,7 +141,7 @@ def _align_slam(
         compared = _compared(files, params.true_camera_to_world, true, indices)
     from_true = _rigid_alignment(params.true_camera_to_world, params.camera_to_world)
     aligned = from_true @ params.true_camera_to_world
-    errors, _ = _apart(aligned, params.camera_to_world)
+    errors = np.linalg.norm(aligned[:, :3, 3] - params.camera_to_world[:, :3, 3], axis=1)
     ate, spread = float(np.sqrt(np.mean(errors**2))), float(aligned[:, :3, 3].std(axis=0).max())
     if ate > LOST * spread:
         log.warning(
@@ -171,7 +168,8 @@ def _compared(
     indices: Int[np.ndarray, "F"],
 ) -> dict[str, float]:
     """Largest differences between the true poses of params.npz and pose.txt."""
-    distances, angles = _apart(stored, true)
+    distances = np.linalg.norm(stored[:, :3, 3] - true[:, :3, 3], axis=1)
+    angles = rotation_angles_deg(stored[:, :3, :3] @ true[:, :3, :3].transpose(0, 2, 1))
     worst = int(np.argmax(np.maximum(distances, angles)))
     if max(distances[worst], angles[worst]) > SAME_SEQUENCE:
         raise InputError(
@@ -195,12 +193,6 @@ def _rigid_alignment(
     rotation = Rotation.from_matrix(rotations).mean().as_matrix()
     translation = (target[:, :3, 3] - source[:, :3, 3] @ rotation.T).mean(axis=0)
     return rigid(rotation[None], translation[None])[0]
-
-
-def _apart(first: Float[np.ndarray, "F 4 4"], second: Float[np.ndarray, "F 4 4"]) -> tuple[np.ndarray, np.ndarray]:
-    """Distances between cameras, mm, and angles between their orientations, degrees. [F] each"""
-    distances = np.linalg.norm(first[:, :3, 3] - second[:, :3, 3], axis=1)
-    return distances, rotation_angles_deg(first[:, :3, :3] @ second[:, :3, :3].transpose(0, 2, 1))
 
 
 def _inverse(matrix: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
