@@ -87,7 +87,8 @@ def load_points(path: Path) -> PointCloud:
     if path.suffix.lower() == ".npz":
         positions, colors = _read_npz(path)
     elif path.suffix.lower() == ".ply":
-        positions, colors = _read_ply(path)
+        vertices = read_vertices(path)
+        positions, colors = np.stack([vertices[axis] for axis in "xyz"], axis=1), vertex_colors(path, vertices)
     else:
         raise InputError(f"{path} is neither .ply nor .npz", "a PLY or NPZ file of points")
     return PointCloud(
@@ -124,9 +125,3 @@ def _read_npz(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
     if colors is not None and (colors.shape != positions.shape or colors.dtype != np.uint8):
         raise InputError(f"{path}: colors of shape {colors.shape}, {colors.dtype}", f"uint8 of shape {positions.shape}")
     return positions, colors
-
-
-def _read_ply(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
-    vertices = read_vertices(path)
-    positions = np.stack([vertices[axis] for axis in "xyz"], axis=1)
-    return positions, vertex_colors(path, vertices)
