@@ -298,29 +298,18 @@ class ColmapDataManager(RecordedDataManager):
             )
             for number, lens in model.cameras.items()
         }
-        names = reading.short_names(model.names)
         others = reading.unposed_images(paths, (*masks, *depths))
         if atlas is None:  # else it says why images have no pose, or which other model has one
             reading.warn_of_unposed(model.files[1], others)
+        names = reading.short_names(model.names)
+        parts = zip(model.images, names, paths, model.camera_to_world, depths, forms, masks, strict=True)
         shots, misplaced = [], 0
-        for index, image in enumerate(model.images):
-            camera_to_world = model.camera_to_world[index].copy()
+        for image, name, file, pose, depth, form, mask in parts:
+            camera_to_world, rectification = pose.copy(), rectifications[image.camera]
             camera_to_world[:3, 3] *= settings.scale
-            rectification, depth = rectifications[image.camera], depths[index]
             sparse, off = self._sparse_depth(model, image, camera_to_world, rectification)
             misplaced += off
-            shots.append(
-                Shot(
-                    names[index],
-                    paths[index],
-                    rectification,
-                    camera_to_world,
-                    depth,
-                    forms[index],
-                    masks[index],
-                    sparse_depth=sparse,
-                )
-            )
+            shots.append(Shot(name, file, rectification, camera_to_world, depth, form, mask, sparse))
         kinds = sorted({lens.model for lens in model.cameras.values()})
         facts: dict[str, Any] = {
             "layout": "colmap",

@@ -195,18 +195,12 @@ class NerfstudioDataManager(RecordedDataManager):
         others = [path for of_frame in zip(depths, masks, confidences, strict=True) for path in of_frame]
         unposed = reading.unposed_images(images, others)
         reading.warn_of_unposed(file, unposed)
+        names = reading.short_names(transforms.names)
+        forms = [None if depth is None else scaled_depth(depth, depth_unit) for depth in depths]
+        parts = zip(names, images, lenses, camera_to_world, depths, forms, masks, confidences, strict=True)
         shots = [
-            Shot(
-                short,
-                images[index],
-                rectifications[lenses[index]],
-                camera_to_world[index],
-                depth,
-                None if depth is None else scaled_depth(depth, depth_unit),
-                masks[index],
-                confidence=confidences[index],
-            )
-            for index, (short, depth) in enumerate(zip(reading.short_names(transforms.names), depths, strict=True))
+            Shot(name, image, rectifications[lens], pose, depth, form, mask, confidence=confidence)
+            for name, image, lens, pose, depth, form, mask, confidence in parts
         ]
         kinds = sorted({type(lens).__name__ for lens in lenses})
         facts: dict[str, Any] = {
