@@ -162,8 +162,8 @@ def test_a_run_goes_on_from_its_newest_whole_checkpoint(wall, tmp_path, monkeypa
 @pytest.mark.thorough
 def test_progress_ends_with_the_last_cell_not_with_its_last_step(wall, tmp_path, capsys):
     compare_inline(["coliags", "scaffold-gs"], [wall], tmp_path / "new")
-    lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("compare")]
-    assert len(lines) == 1 and lines[0].startswith("compare 6/6, took") and lines[0].endswith("2 done")
+    (line,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("compare 6/6")]
+    assert line.startswith("compare 6/6, took") and line.endswith("2 done")
 
 
 # What fails
