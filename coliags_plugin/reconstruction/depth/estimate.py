@@ -53,8 +53,6 @@ from coliags_plugin.reconstruction.depth.sweeping import (
 log = logging.getLogger(__name__)
 
 Arrays = Mapping[str, np.ndarray]
-#: What describes the estimation, in the folder of its work files.
-_REQUEST = "request.json"
 
 
 @dataclass(frozen=True)
@@ -92,7 +90,7 @@ def work_folder(out: Path, request: Mapping[str, Any]) -> Iterator[WorkFolder]:
     path = out.parent / f".{out.name}.work"
     make_folder(path)
     with locked(path / "lock", out):
-        file, described = path / _REQUEST, json.loads(json.dumps(dict(request)))
+        file, described = path / "request.json", json.loads(json.dumps(dict(request)))
         stored = json.loads(file.read_text()) if file.is_file() else None
         if stored is not None and stored != described:
             log.warning("%s: work files of other data or options are removed", path)
@@ -257,10 +255,10 @@ class Estimation:
             if not self.work.file(stage, index).is_file():
                 self.work.save(stage, index, function(index))
 
-        done = self.work.path / f"{stage}.done"
-        if not done.is_file():
+        marker = self.work.path / f"{stage}.done"
+        if not marker.is_file():
             parallel_map(one, range(len(self.frames)), title, self.progress, self.jobs)
-            atomic_write(done, "")
+            atomic_write(marker, "")
             if self.last:  # this stage was made from it
                 shutil.rmtree(self.work.path / self.last, ignore_errors=True)
         self.last = stage
