@@ -179,29 +179,9 @@ def composite_gaussians(
     offsets = grid.centers(pairs.tile, table.dtype) - of_pairs[:, :2]
     polynomials = log_alpha_polynomials(of_pairs[:, 5], of_pairs[:, 2:5], offsets)
     pixels = monomials(grid.offsets(table))
-    composited: Tensor = _Composite.apply(polynomials, of_pairs[:, 6:], pairs.starts, pixels, cuts)  # type: ignore[no-untyped-call]
-    sums = grid.to_image(composited)
-    if depths is None:
-        return sums, None
-    medians = median_depths(polynomials, depths[pairs.gaussian], pairs.starts, pixels, cuts)
-    return sums, grid.to_image(medians[:, None])[..., 0]
-
-
-@torch.no_grad()
-def median_depths(
-    polynomials: Float[Tensor, "M 6"],
-    depths: Float[Tensor, "M"],
-    starts: Int[Tensor, "tiles+1"],
-    pixels: Float[Tensor, "6 P"],
-    cuts: CutSettings,
-) -> Float[Tensor, "tiles P"]:
-    """Depth of the pair that brings the transmittance to one half or less; 0 where none does. [tiles, P]"""
-    medians = depths.new_zeros(len(starts) - 1, pixels.shape[1])
-    for chunk in _sweep_gaussians(padded_rows(polynomials, 0), starts, pixels, cuts):
-        crossing, crosses = crossing_of_half(chunk)
-        rows = chunk.rows.view(chunk.weights.shape[:2]).gather(1, crossing).clamp_max(len(depths) - 1)
-        medians[chunk.tiles] += torch.where(crosses, depths[rows], 0.0)
-    return medians
+    of_depths = None if depths is None else depths[pairs.gaussian]
+    composited, medians = _Composite.apply(polynomials, of_pairs[:, 6:], of_depths, pairs.starts, pixels, cuts)  # type: ignore[no-untyped-call]
+    return grid.to_image(composited), None if medians is None else grid.to_image(medians[:, None])[..., 0]
 
 
 def _sweep_gaussians(padded: Tensor, starts: Tensor, pixels: Tensor, cuts: CutSettings) -> Iterator[Chunk[None]]:
@@ -214,23 +194,36 @@ def _sweep_gaussians(padded: Tensor, starts: Tensor, pixels: Tensor, cuts: CutSe
 
 
 class _Composite(torch.autograd.Function):
-    """Sum of weight times feature over the pairs of each tile, by tile and front to back. [tiles, F, P]"""
+    """Sum of weight times feature over the pairs of each tile, [tiles, F, P], and median depth, [tiles, P], or None."""
 
     @staticmethod
     def forward(
-        ctx: Any, polynomials: Tensor, features: Tensor, starts: Tensor, pixels: Tensor, cuts: CutSettings
-    ) -> Tensor:
+        ctx: Any,
+        polynomials: Tensor,
+        features: Tensor,
+        depths: Tensor | None,
+        starts: Tensor,
+        pixels: Tensor,
+        cuts: CutSettings,
+    ) -> tuple[Tensor, Tensor | None]:
         padded, padded_features = padded_rows(polynomials, 0), torch.nn.functional.pad(features, (0, 0, 0, 1))
         composited = features.new_zeros(len(starts) - 1, features.shape[1], pixels.shape[1])
+        medians = None if depths is None else depths.new_zeros(len(starts) - 1, pixels.shape[1])
         for chunk in _sweep_gaussians(padded, starts, pixels, cuts):
             composited[chunk.tiles] += chunk.rows_of(padded_features).mT @ chunk.weights
+            if depths is not None and medians is not None:
+                crossing, crosses = crossing_of_half(chunk)
+                rows = chunk.rows.view(chunk.weights.shape[:2]).gather(1, crossing).clamp_max(len(depths) - 1)
+                medians[chunk.tiles] += torch.where(crosses, depths[rows], 0.0)
         ctx.save_for_backward(padded, padded_features, starts, pixels, composited)
         ctx.cuts = cuts
-        return composited
+        if medians is not None:
+            ctx.mark_non_differentiable(medians)
+        return composited, medians
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, gradient: Tensor, _: Tensor | None) -> tuple[Tensor | None, ...]:
         padded, padded_features, starts, pixels, composited = ctx.saved_tensors
         of_polynomials, of_features = torch.zeros_like(padded), torch.zeros_like(padded_features)
         gradient = gradient.contiguous()
@@ -241,7 +234,7 @@ class _Composite(torch.autograd.Function):
             of_features[chunk.rows] = (chunk.weights @ tile_gradient.mT).flatten(0, 1)
             gained = (chunk.rows_of(padded_features) @ tile_gradient).mul_(chunk.weights)
             of_polynomials[chunk.rows] = chunk.of_log_alphas(gained, behind, ctx.cuts.alpha_max) @ pixels.T
-        return of_polynomials[:-1], of_features[:-1], None, None, None
+        return of_polynomials[:-1], of_features[:-1], None, None, None, None
 
 
 # --- surfels ----------------------------------------------------------------------------------------------------------

@@ -107,20 +107,16 @@ def _view_table(camera: Camera, pose: Tensor, settings: CutSettings) -> np.ndarr
 
 def _unusable(gaussians: Gaussians) -> InputError:
     """The error for the first invalid Gaussian."""
-    for name in _TENSORS:
-        values = getattr(gaussians, name).detach()
-        wrong = ~values.isfinite().reshape(len(values), -1).all(dim=1)
-        if wrong.any():
-            index = int(wrong.nonzero()[0])
-            return InputError(f"{name}[{index}] is {values[index].tolist()}", "finite numbers")
-    scales, quats = gaussians.scales.detach(), gaussians.quats_wxyz.detach()
-    wrong = (scales < 0).any(dim=1)
-    if wrong.any():
-        index = int(wrong.nonzero()[0])
-        return InputError(f"scales[{index}] is {scales[index].tolist()}", "standard deviations, not below 0")
-    lengths = quats.square().sum(dim=1)
-    index = int((~((lengths >= 1e-24) & lengths.isfinite())).nonzero()[0])
-    return InputError(
-        f"quats_wxyz[{index}] is {quats[index].tolist()}, of squared length {float(lengths[index])}",
-        "a quaternion whose length float32 can hold, and not 0",
-    )
+    squared = gaussians.quats_wxyz.detach().square().sum(dim=1)
+    checks = [(name, getattr(gaussians, name).isfinite(), "finite numbers") for name in _TENSORS]
+    checks += [
+        ("scales", gaussians.scales >= 0, "standard deviations, not below 0"),
+        (
+            "quats_wxyz",
+            (squared >= 1e-24) & squared.isfinite(),
+            "a quaternion whose length float32 can hold, and not 0",
+        ),
+    ]
+    name, usable, expected = next(check for check in checks if not check[1].all())
+    index = int((~usable.reshape(len(usable), -1).all(dim=1)).nonzero()[0])
+    return InputError(f"{name}[{index}] is {getattr(gaussians, name)[index].tolist()}", expected)

@@ -12,7 +12,6 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from coliags_plugin.core.cameras import Camera
-from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.gaussians import Gaussians, rotation_matrices, shortest_columns
 
 #: Margin beyond the image, relative to half the field of view, within which the Jacobian is not clamped.
@@ -43,12 +42,6 @@ def project_gaussians(gaussians: Gaussians, camera: Camera, eps2d: float) -> Pro
     Those whose centre has z <= the camera's near plane are not drawn; ``eps2d``, square pixels, is added to both
     diagonal terms of the 2D covariance.
     """
-    if gaussians.scales.shape[-1] != 3:
-        raise InputError(
-            f"Gaussians with scales of shape {list(gaussians.scales.shape)}",
-            "three scales each, [N, 3]",
-            "Choose a renderer that serves surfels",
-        )
     camera = camera.to(gaussians.means.device, gaussians.means.dtype)
     camera_axes = camera.camera_to_world[:3, :3]
     # Subtracting the centre before rotating keeps float32 accurate far from the world's origin.

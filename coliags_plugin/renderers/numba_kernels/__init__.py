@@ -16,7 +16,6 @@ backward, gather, project backward. 3D Gaussians and surfels have the same kerne
 - **sweep**: compositing of all tiles (forward), or its derivatives (backward), both front to back.
 - **sums**: derivatives added up over the pixels of an entry, then over the entries of a Gaussian.
 - **crew**: the threads that run a kernel; each takes the next parcel, stretch or tile from a shared counter.
-- **arena**: memory that is kept between renderings.
 
 Arguments of kernels, besides: ``counters`` are zeros from which threads take work; ``view``, ``grid``, ``projections``,
 ``bins`` and ``pairs`` are what ``layout`` describes, and ``outputs`` what is composited; ``scratch`` has NUMBERS and

@@ -64,6 +64,7 @@ def _project_gaussians(first, last, gaussians, view, normals, projections, means
     three = (0, 0, 0)
     log2_alpha_min = vec.broadcast(view, layout.VIEW_LOG2_ALPHA_MIN)
     low_pass = vec.broadcast(view, layout.VIEW_LOW_PASS)
+    right_axis, down_axis, forward_axis = camera_axes(view)
     right_edge = vec.sub(vec.broadcast(view, layout.VIEW_WIDTH), 0.5)
     bottom_edge = vec.sub(vec.broadcast(view, layout.VIEW_HEIGHT), 0.5)
     for group in range(first, last):
@@ -108,22 +109,17 @@ def _project_gaussians(first, last, gaussians, view, normals, projections, means
 
         vec.store_columns(means2d, 2 * row, (mean_x, mean_y))
         vec.store(projections.depths, row, at.z)
-        normal = _facing_normals(at, scale, view) if normals else vec.repeat(0.0, three)
+        normal = vec.repeat(0.0, three)
+        if normals:
+            second, third = shortest_axes(scale)
+            axis = shortest_column(at.rotation, second, third)
+            # The line of sight and the axis may be compared in the world as well as in the camera.
+            axis = vec.select(vec.greater(vec.dot(axis, at.offset, 0.0), 0.0), vec.neg(axis), axis)
+            normal = (vec.dot(axis, right_axis, 0.0), vec.dot(axis, down_axis, 0.0), vec.dot(axis, forward_axis, 0.0))
         whole = (u_xx, u_yx, u_yy, mean_x, mean_y, log2_opacity) + color
         whole = whole + (at.z, at.inverse_z) + normal + (slope_upright, slope_level)
         vec.store_columns(projections.records, layout.ROW * row, whole)
     return (drawn if usable else -1), tiles
-
-
-@inline
-def _facing_normals(at, scale, view):
-    """The shortest axes, camera axes, oriented towards the camera."""
-    second, third = shortest_axes(scale)
-    axis = shortest_column(at.rotation, second, third)
-    # The line of sight and the axis may be compared in the world as well as in the camera.
-    axis = vec.select(vec.greater(vec.dot(axis, at.offset, 0.0), 0.0), vec.neg(axis), axis)
-    right, down, forward = camera_axes(view)
-    return vec.dot(axis, right, 0.0), vec.dot(axis, down, 0.0), vec.dot(axis, forward, 0.0)
 
 
 @inline

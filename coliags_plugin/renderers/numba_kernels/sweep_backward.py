@@ -280,12 +280,7 @@ def _sweep_surfel(row, blocks, alive, rows, outputs, view, state, target, furthe
     return alive
 
 
-@inline
-def _plain_pixels(block, _view):
-    return tiles.block_pixels(block)
-
-
-sweep = sweeping_backward(tiles.fetch_gaussians, _plain_pixels, _prepare_gaussians, _sweep_gaussian, layout.ROW)
+sweep = sweeping_backward(tiles.fetch_gaussians, tiles.block_pixels, _prepare_gaussians, _sweep_gaussian, layout.ROW)
 sweep_surfels = sweeping_backward(
     tiles.fetch_surfels, tiles.scaled_pixels, _prepare_surfels, _sweep_surfel, tiles.FETCHED_SURFEL
 )

@@ -103,7 +103,7 @@ def _finish_tile(tile, outputs, view, state, composited):
 @part
 def _sweep_gaussians(block, count, listed, rows, outputs, view, state):
     """Composite 3D Gaussians into one block: see :func:`sweeping`."""
-    x, y = tiles.block_pixels(block)
+    x, y = tiles.block_pixels(block, view)
     log2_alpha_min, alpha_max, transmittance_min = vec.broadcast_all(view, layout.VIEW_LOG2_ALPHA_MIN, (0, 0, 0))
     at, channels = tiles.STATE * block, outputs.channels
     transmittance, alpha_sum = vec.load(state, at + tiles.TRANSMITTANCE), vec.load(state, at + tiles.ALPHA)

@@ -112,7 +112,7 @@ def fetch_surfels(first, last, alive, corner_x, corner_y, projections, view, cel
 @inline
 def scaled_pixels(block, view):
     """Columns and rows of a block's pixel centres from the middle of its tile, in scaled pixels."""
-    return vec.mul(vec.broadcast(view, layout.VIEW_PIXEL_SCALE), block_pixels(block))
+    return vec.mul(vec.broadcast(view, layout.VIEW_PIXEL_SCALE), block_pixels(block, view))
 
 
 @inline
@@ -146,7 +146,7 @@ def block_corner(block):
 
 
 @inline
-def block_pixels(block):
+def block_pixels(block, _view):
     """Columns and rows of a block's pixel centres from the middle of its tile."""
     x, y = block_corner(block)
     half = 0.5 * layout.TILE - 0.5
