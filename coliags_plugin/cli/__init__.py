@@ -15,6 +15,7 @@ from coliags_plugin.cli import comparing, methods, poses, runs, scenes
 from coliags_plugin.cli.texts import in_flags, translate_for
 from coliags_plugin.core import __version__
 from coliags_plugin.core.errors import ReportedError
+from coliags_plugin.core.libraries import separate_stderr
 
 
 class Runnable(Protocol):
@@ -66,6 +67,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     # decoding took up to 2000 ms instead of 40. A short spin keeps the speed of an idle machine and loses little on a
     # busy one. It is read when torch is first imported.
     os.environ.setdefault("GOMP_SPINCOUNT", "10000")
+    if argv is None:
+        separate_stderr()
     # The shell leaves a ~ that is quoted or comes after "=", as in --data=~/scene.
     arguments = sys.argv[1:] if argv is None else argv
     words = [f[1] + os.path.expanduser(f[2]) if (f := _HOME.fullmatch(word)) else word for word in arguments]

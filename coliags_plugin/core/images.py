@@ -16,6 +16,7 @@ from jaxtyping import Bool, Shaped, UInt8
 from coliags_plugin.core import bounds
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_write
+from coliags_plugin.core.libraries import decoder_messages
 from coliags_plugin.core.text_files import unreadable
 
 if TYPE_CHECKING:
@@ -41,17 +42,18 @@ def decode_image(path: Path, flags: int | None = None) -> Shaped[np.ndarray, "H 
         raise InputError(f"cannot read {path}: {error.strerror or error}", "a readable image") from error
     _check_size(path, data)
     image = None
-    if data and (not data.startswith(_PNG[:4]) or _is_whole_png(data)):
-        with suppress(cv2.error):  # of more than 2^30 pixels, for instance
-            image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED if flags is None else flags)
-    if image is None:
-        heif = data[4:8] == b"ftyp" and "It is HEIF (.heic, .avif): convert it to PNG"
-        raise unreadable(
-            path,
-            f"{path} ({len(data)} bytes) cannot be decoded",
-            "a complete image",
-            heif or "It is damaged or cut short: fetch it again",
-        )
+    with decoder_messages():
+        if data and (not data.startswith(_PNG[:4]) or _is_whole_png(data)):
+            with suppress(cv2.error):  # of more than 2^30 pixels, for instance
+                image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED if flags is None else flags)
+        if image is None:
+            heif = data[4:8] == b"ftyp" and "It is HEIF (.heic, .avif): convert it to PNG"
+            raise unreadable(
+                path,
+                f"{path} ({len(data)} bytes) cannot be decoded",
+                "a complete image",
+                heif or "It is damaged or cut short: fetch it again",
+            )
     return np.asarray(image)
 
 

@@ -21,6 +21,7 @@ from coliags_plugin.core.arrays import read_array
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import decode_image, kind_of
 from coliags_plugin.core.json_files import image_size, read_json, read_number
+from coliags_plugin.core.libraries import decoder_messages
 from coliags_plugin.core.scene_files import for_all, named_file, required_file
 from coliags_plugin.core.text_files import unreadable
 from coliags_plugin.geometry.lenses.models import FisheyeLens, Lens, OpenCVLens, PinholeLens
@@ -230,6 +231,7 @@ def read_exr_channel(path: Path, channel: str, do: str) -> Float32[np.ndarray, "
         with (
             _ALONE,
             redirect_stdout(io.StringIO()),  # OpenEXR prints warnings
+            decoder_messages(),
             OpenEXR.File(str(path), separate_channels=True) as file,
         ):
             # OpenEXR returns no parts for a damaged file.

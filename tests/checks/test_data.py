@@ -12,11 +12,11 @@ import pytest
 import torch
 
 from coliags_plugin.checks.data.check import check_scene, video_pairs
-from coliags_plugin.checks.data.findings import findings_of, image_facts, path_facts
+from coliags_plugin.checks.data.findings import findings_of, image_facts, lamp_facts, path_facts
 from coliags_plugin.checks.data.hypotheses import CHANGES, FrameMatches, Pair, agreement, best_scale, supported
 from coliags_plugin.checks.data.page import check_page
 from coliags_plugin.core.cameras import Camera
-from coliags_plugin.core.scenes import Frame, PointCloud, Scene
+from coliags_plugin.core.scenes import Frame, PointCloud, Scene, SparseDepth
 from coliags_plugin.datamanagers.c3vd import C3VDDataManager, C3VDSettings
 from coliags_plugin.reporting.text_formats import page_text
 from tests.commands import run
@@ -264,6 +264,32 @@ def test_a_camera_that_hardly_moves_is_undecided(frames):
     assert check.matches["given"].in_front is None
     assert not any("poses" in finding.what for finding in check.findings)
     assert "Undecided\nposes may be right or wrong: " in page_text(check_page(check))
+
+
+def lit(frames: list[Frame]) -> list[Frame]:
+    """The frames under a lamp at the camera: brightness falls with the square of the depth."""
+    factors = [(18.0 / frame.depth.clamp(min=18.0)).square()[..., None] for frame in frames]
+    return [frame.with_maps(image=(frame.image * factor).byte()) for frame, factor in zip(frames, factors, strict=True)]
+
+
+@pytest.mark.thorough
+def test_reversed_depth_contradicts_the_lamp(frames):
+    def only_points(frame):
+        pixels = torch.rand(200, 2, generator=torch.Generator().manual_seed(frame.index)) * torch.tensor([160, 128])
+        column, row = pixels.long().unbind(1)
+        return replace(frame.with_maps(depth=None), sparse_depth=SparseDepth(pixels, frame.depth[row, column]))
+
+    sound = lit(frames)
+    reverse = [frame.with_maps(depth=600.0 / frame.depth) for frame in sound]
+    assert lamp_facts(sound)["correlation"] < -0.5
+    assert lamp_facts(reverse)["correlation"] > 0.5
+    assert lamp_facts([only_points(frame) for frame in sound])["correlation"] < -0.5
+    check = check_scene(scene_of(sound))
+    assert "the far is brighter" not in [finding.what for finding in check.findings]
+    assert "rank correlation -" in page_text(check_page(check))
+    assert "the far is brighter" in whats(scene_of(reverse))
+    assert "the far is brighter" in whats(scene_of([only_points(frame) for frame in reverse]))
+    assert lamp_facts([frame.with_maps(depth=None) for frame in sound]) is None
 
 
 def test_features_are_matched_at_the_stored_size(frames, tmp_path, capsys, caplog):

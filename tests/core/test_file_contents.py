@@ -6,8 +6,11 @@ import io
 import os
 import resource
 import struct
+import subprocess
+import sys
 import zipfile
 import zlib
+from concurrent.futures import ThreadPoolExecutor
 
 import cv2
 import numpy as np
@@ -20,12 +23,14 @@ from coliags_plugin.core.bounds import JSON_BYTES
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import decode_image, encode_image, write_image, write_mask
 from coliags_plugin.core.json_files import read_json
+from coliags_plugin.core.libraries import decoder_messages
 from coliags_plugin.core.ply import point_properties, read_triangles, read_vertices, write_ply
 from coliags_plugin.core.text_files import read_text, text_lines, whole_text
 from coliags_plugin.datamanagers.fusion import load_points
 from coliags_plugin.export.splats.formats import read_splats
 from coliags_plugin.geometry.meshes.mesh import read_mesh
 from coliags_plugin.geometry.poses.formats import format_of
+from tests.layouts import write_exr
 
 # NPZ and NPY files that are damaged or lie about their size
 
@@ -346,9 +351,6 @@ def chunk(kind, data, length=None):
 def test_damaged_images_are_refused_before_memory_is_asked_for(tmp_path):
     whole = encode_image(np.zeros((5, 7), np.uint8))
     start, rest = whole[:33], whole[33:]
-    noise = np.random.default_rng(0).integers(0, 255, (40, 50, 3)).astype(np.uint8)
-    png, tiff = (bytearray(encode_image(noise, suffix)) for suffix in (".png", ".tiff"))
-    png[len(png) // 2] ^= 0xFF
     # OpenCV would allocate what the length of a chunk says.
     long = start + chunk(b"IDAT", b"x" * 20, 1 << 30) + rest
     sizes = ((60_000, 60_000), (30_000, 30_000), (40_000, 10), (2**31 - 1, 1))
@@ -365,8 +367,6 @@ def test_damaged_images_are_refused_before_memory_is_asked_for(tmp_path):
             for width, height in sizes
         },
         "text": (b"no image at all", "cannot be decoded"),
-        "wrong checksum": (bytes(png), "cannot be decoded"),
-        "half of a TIFF": (bytes(tiff[: len(tiff) // 2]), "cannot be decoded"),
     }
     for name, (data, message) in damaged.items():
         path = tmp_path / f"{name}.png"
@@ -377,3 +377,62 @@ def test_damaged_images_are_refused_before_memory_is_asked_for(tmp_path):
         assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 200_000, name  # KiB
     with pytest.raises(InputError, match="cannot read"):
         decode_image(tmp_path / "missing.png")
+
+
+# What decoders in C print: nothing on the terminal, and a warning where no error tells it
+
+
+READ = """if True:
+    import logging, sys
+    from pathlib import Path
+    from coliags_plugin.core.libraries import separate_stderr
+    from coliags_plugin.core.errors import InputError
+    from coliags_plugin.core.images import decode_image
+    from coliags_plugin.datamanagers.file_formats import read_exr_channel
+    separate_stderr()
+    logging.basicConfig(format="log: %(message)s")
+    for path in map(Path, sys.argv[1:]):
+        try:
+            read_exr_channel(path, "Y", "") if path.suffix == ".exr" else decode_image(path)
+        except InputError as error:
+            print("refused:", error, file=sys.stderr)
+"""
+
+
+@pytest.mark.thorough
+def test_damage_is_told_once_and_a_warning_where_it_is_decoded(tmp_path):
+    pixels = np.random.default_rng(0).integers(0, 255, (40, 50, 3)).astype(np.uint8)
+    write_exr(tmp_path / "a.exr", {"Y": np.random.default_rng(0).random((40, 50)).astype(np.float32)})
+    png, tiff, jpg = (encode_image(pixels, suffix) for suffix in (".png", ".tiff", ".jpg"))
+    exr, middle = (tmp_path / "a.exr").read_bytes(), len(png) // 2
+    damaged = {
+        "a.png": png[:middle] + bytes([png[middle] ^ 0xFF]) + png[middle + 1 :],  # libpng: CRC error
+        "a.tiff": tiff[: len(tiff) // 2],  # libtiff: seek error
+        "a.exr": exr[: len(exr) // 2],  # OpenEXR: corrupt leader, and a warning on stdout
+        "a.jpg": jpg[:-2] + b"0123456789" + jpg[-2:],  # libjpeg: extraneous bytes
+    }
+    for name, data in damaged.items():
+        (tmp_path / name).write_bytes(data)
+    command = [sys.executable, "-c", READ, *(str(tmp_path / name) for name in damaged)]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    *refused, warning = done.stderr.splitlines()
+    assert done.stdout == "" and len(refused) == 3
+    for line, name in zip(refused, damaged, strict=False):
+        assert line.startswith("refused: ") and str(tmp_path / name) in line
+    assert warning.startswith("log: an image is read that may be damaged; its decoder says: Corrupt JPEG data: ")
+
+
+def test_threads_share_it_and_the_terminal_comes_back(capfd, caplog):
+    def decode(number):
+        with decoder_messages():
+            os.write(2, b"noise\n")
+        return number
+
+    with ThreadPoolExecutor(8) as pool:
+        assert list(pool.map(decode, range(200))) == list(range(200))
+    assert {record.message.rpartition(": ")[2] for record in caplog.records} == {"noise"}
+    with pytest.raises(KeyError), decoder_messages():
+        os.write(2, b"noise\n")
+        raise KeyError
+    os.write(2, b"after\n")
+    assert capfd.readouterr().err == "after\n"

@@ -46,7 +46,7 @@ class SceneCheck:
 
     scene: Scene  # the scene checked
     pairs: FramePairs  # source and target frames of the reprojection or matching
-    facts: dict[str, Any]  # JSON objects of depth, path and images; None where there is nothing to measure
+    facts: dict[str, Any]  # JSON objects of depth, path, images and lamp; None where there is nothing to measure
     agreement: dict[str, Agreement]  # reprojection errors of frames with depth, by pose hypothesis
     scale: BestScale | None  # the factor on depth with the smallest reprojection error, and the errors with it
     #: epipolar errors of matched points, by pose hypothesis; empty where there is depth or too few are matched
@@ -107,19 +107,20 @@ def check_scene(
         undecided = undecided or rules.findings_of("parallax", rules.match_facts(matches))
     sample = rules.sampled_frames(video)
     depth, path = rules.depth_facts(sample), rules.path_facts(video)
-    images = rules.image_facts(sample)
+    images, lamp = rules.image_facts(sample), rules.lamp_facts(sample)
     can_disagree = path and path["length"] and depth and not rules.is_flat(depth)
     measured = [
         ("agreement", rules.agreement_facts(agreements, scale, is_estimated(video)) if can_disagree else None),
         ("matches", rules.match_facts(matches)),
         ("points", dict(vars(scene.provenance))),
         ("depth", depth and depth | {"metric": scene.is_metric}),
+        ("lamp", lamp),
         ("path", path),
         *(("camera", camera) for camera in rules.camera_facts(video)),
         ("images", images | {"repeats": len(images["repeated"])}),
     ]
     findings = [finding for about, values in measured for finding in rules.findings_of(about, values)]
-    facts = {"depth": depth, "path": path, "images": images}
+    facts = {"depth": depth, "path": path, "images": images, "lamp": lamp}
     return SceneCheck(scene, pairs, facts, agreements, scale, matches, matched_by, findings, undecided)
 
 

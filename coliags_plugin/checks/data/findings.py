@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.stats
 import torch
 from jaxtyping import Float
 
@@ -17,13 +18,19 @@ from coliags_plugin.core.scenes import Frame
 
 #: Largest number of frames sampled for depth and image statistics.
 _FRAMES = 64
+#: For the correlation of brightness and distance: largest number of frames and of pixels per frame, and fewest pixels.
+_LAMP_FRAMES, _LAMP_PIXELS, _LAMP_MIN_PIXELS = 16, 4000, 30
 #: Smallest share of the pairs of frames in which points must be found again, else nothing is judged.
 MIN_MATCHED = 0.25
+#: Grey levels outside these are clipped.
+_DARKEST, _BRIGHTEST = 3, 253
+#: Smallest ratio of the 90th to the 10th percentile of the distances in a frame.
+_MIN_DEPTH_RATIO = 1.15
 
 
-def sampled_frames(frames: Sequence[Frame]) -> list[Frame]:
-    """Evenly spaced sample of the frames, at most 64."""
-    indices = np.unique(np.linspace(0, len(frames) - 1, min(len(frames), _FRAMES)).astype(int))
+def sampled_frames(frames: Sequence[Frame], count: int = _FRAMES) -> list[Frame]:
+    """Evenly spaced sample of the frames, at most ``count``."""
+    indices = np.unique(np.linspace(0, len(frames) - 1, min(len(frames), count)).astype(int))
     return [frames[index] for index in indices]
 
 
@@ -120,6 +127,53 @@ def image_facts(frames: Sequence[Frame]) -> JsonObject:
         "masked_share": float(np.mean(masked)),
         "repeated": repeated,
     }
+
+
+def lamp_facts(frames: Sequence[Frame]) -> JsonObject | None:
+    """Rank correlation (Spearman's) of brightness with distance within frames: median, share above 0, and their number.
+
+    It is -1 where every farther pixel is darker, as under a lamp at the camera. None where no frame has enough depth.
+    """
+    correlations = [_correlation(frame) for frame in sampled_frames(frames, _LAMP_FRAMES)]
+    values = np.array([value for value in correlations if value is not None])
+    if not len(values):
+        return None
+    return {
+        "correlation": float(np.median(values)),
+        "rising_share": float(np.mean(values > 0.0)),
+        "frames": len(values),
+    }
+
+
+def _correlation(frame: Frame) -> float | None:
+    """Correlation in one frame, from its dense depth or else its single points; None if too few or equally far."""
+    pixels, depth = _known_depth(frame)
+    brightness = frame.image.numpy()[pixels[:, 1], pixels[:, 0]]
+    clear = (brightness.min(axis=1) > _DARKEST) & (brightness.max(axis=1) < _BRIGHTEST)
+    clear &= frame.valid.numpy()[pixels[:, 1], pixels[:, 0]]
+    if clear.sum() < _LAMP_MIN_PIXELS:
+        return None
+    rays = frame.camera.rays_at(torch.from_numpy(pixels[clear])).double().norm(dim=1).numpy()
+    distance = depth[clear] * rays
+    near, far = np.quantile(distance, (0.1, 0.9))
+    mean = brightness[clear].mean(axis=1)
+    if far < _MIN_DEPTH_RATIO * near or mean.min() == mean.max():
+        return None
+    return float(scipy.stats.spearmanr(mean, distance).statistic)
+
+
+def _known_depth(frame: Frame) -> tuple[np.ndarray, Float[np.ndarray, "K"]]:
+    """Columns and rows of pixels of known depth [K, 2], and their z-depth [K]."""
+    dense, sparse = frame.depth, frame.sparse_depth
+    if dense is not None:
+        row, column = np.nonzero(np.isfinite(dense.numpy()))
+        every = max(1, len(row) // _LAMP_PIXELS)
+        row, column = row[::every], column[::every]
+        return np.stack([column, row], axis=1), dense.numpy()[row, column].astype(np.float64)
+    if sparse is None:
+        return np.zeros((0, 2), np.int64), np.zeros(0)
+    limits = np.array([frame.camera.width, frame.camera.height]) - 1
+    return sparse.pixels.floor().long().numpy().clip(0, limits), sparse.depth.double().numpy()
 
 
 #: Largest median depth difference of agreeing frames, relative to the depth, if it is true; and if it is estimated: two
@@ -307,6 +361,14 @@ RULES: dict[str, list[tuple[Callable[[JsonObject], bool], str]]] = {
         (
             lambda depth: depth["metric"] and depth["median"] > 1000.0,
             "depth is too far for an endoscope | median {median:.4g} mm | Check the unit of the depth files",
+        ),
+    ],
+    "lamp": [
+        (
+            lambda lamp: lamp["frames"] >= 4 and lamp["correlation"] > 0.3 and lamp["rising_share"] > 0.75,
+            "the far is brighter than the near | brightness rises with distance (rank correlation {correlation:.2f}, "
+            "the median of {frames} frames), though the lamp is at the camera | "
+            "Check whether the depth is reversed: a disparity, inverse or inverted depth, or one of other images",
         ),
     ],
     "path": [

@@ -65,7 +65,7 @@ def _facts(check: SceneCheck) -> Iterator[model.Fact]:
     unit = scene.length_unit
     stated = "unknown (`datamanager.unit=mm` or a file unit.txt states it)"
     yield model.Fact("unit of length", unit if scene.is_metric else stated)
-    depth, path, images = check.facts.values()
+    depth, path, images, lamp = check.facts.values()
     depths = (
         "median {median:.4g}, 1 % to 99 %: {nearest:.4g} to {farthest:.4g} {unit}; {invalid_share:.1%} unknown, of "
         "which {clipped_share:.1%} clipped"
@@ -81,6 +81,9 @@ def _facts(check: SceneCheck) -> Iterator[model.Fact]:
         "{masked_share:.1%} masked"
     )
     yield model.Fact("brightness", light.format(**images))
+    if lamp:
+        correlation = f"rank correlation {lamp['correlation']:.2f} (median of {counted(lamp['frames'], 'frame')})"
+        yield model.Fact("brightness and distance", f"{correlation}; below 0, the near is brighter")
     yield model.Fact("initial points", f"{len(scene.points)} from {data.points.source}")
 
 
