@@ -23,7 +23,6 @@ from coliags_plugin.core.numba_kernels.compilation import Array
 from coliags_plugin.core.numba_kernels.threads import Crew
 from coliags_plugin.core.tensors import tables
 from coliags_plugin.renderers.numba_kernels import (
-    binning,
     layout,
     projection,
     projection_backward,
@@ -270,7 +269,7 @@ class Pipeline:
         )
         entry_counts, circle = take(drawn, dtype=np.int32), layout.count(self.primitive.circle)
         given = (self._projections, self._view, grid, circle, nearest_first)
-        crew.run(binning.find_pairs, *given, pairs, entry_counts)
+        crew.run(tiles.find_pairs, *given, pairs, entry_counts)
         counts = pairs.tile_counts.reshape(stretches, grid.tiles)
         ends = counts.T.cumsum(dtype=np.int64).reshape(grid.tiles, stretches)
         counts[:] = ends.T - counts
@@ -284,7 +283,7 @@ class Pipeline:
             order=np.argsort(-np.diff(starts), kind="stable"),
             reached=take(grid.tiles, dtype=np.int64),
         )
-        crew.run(binning.sort_pairs, grid, pairs, self._bins)
+        crew.run(tiles.sort_pairs, grid, pairs, self._bins)
 
     def _nearest_first(self) -> Array:
         """Indices of the Gaussians drawn; those of equal depth keep their order."""
