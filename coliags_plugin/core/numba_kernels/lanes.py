@@ -152,12 +152,8 @@ def _write_all(builder: ir.IRBuilder, values: Sequence[ir.Value], addresses: Seq
 # --- operands ---------------------------------------------------------------------------------------------------------
 
 
-def _is_scalar(numba_type: types.Type) -> bool:
-    return isinstance(numba_type, (types.Integer, types.Float))
-
-
 def _is_numeric(numba_type: types.Type) -> bool:
-    return isinstance(numba_type, (Lanes, DoubleLanes)) or _is_scalar(numba_type)
+    return isinstance(numba_type, (Lanes, DoubleLanes, types.Integer, types.Float))
 
 
 def _is_tuple(numba_type: types.Type) -> bool:
