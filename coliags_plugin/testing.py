@@ -44,7 +44,6 @@ from coliags_plugin.engine.model import Model
 from coliags_plugin.engine.rendering import render_run
 from coliags_plugin.engine.trained import TrainedRun, load_trained
 from coliags_plugin.engine.trainer import Trainer
-from coliags_plugin.results.reading import means_summary
 
 __all__ = ["METHOD_CHECKS", "CheckContext", "CheckFailedError", "CheckSkippedError", "name_of_check"]
 
@@ -426,7 +425,7 @@ def _step_changes_rows(trainer: Trainer) -> bool:
 def check_evaluates(context: CheckContext) -> None:
     """The method's protocol yields finite metrics, or reasons for those that cannot be had."""
     trained = _few_frames(context)
-    summary = means_summary(evaluate(trained, trained.config.protocol))
+    summary = evaluate(trained, trained.config.protocol).summary()
     metrics, reasons = {name: summary[name] for name in summary["directions"] if name in summary}, summary["reasons"]
     unexplained = [
         name for name, value in metrics.items() if not (reasons.get(name) if value is None else math.isfinite(value))

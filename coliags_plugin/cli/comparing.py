@@ -107,12 +107,12 @@ class ResultsCommand:
         """Print a table for each."""
         from coliags_plugin.reporting.model import Block, Fact, FactList
         from coliags_plugin.reporting.text_formats import terminal_text
-        from coliags_plugin.results.reading import facts, find_results, means_summary
+        from coliags_plugin.results.reading import facts, find_results
 
         blocks: list[Block] = []
         summaries = []
         for result in find_results([self.path]):
             texts = facts(result)
             blocks += [result.table(), FactList([Fact(name, text) for name, text in texts.items()])]
-            summaries.append({**means_summary(result), "facts": texts})
+            summaries.append({**result.summary(), "facts": texts})
         print_summary(terminal_text(blocks), {"results": summaries}, as_json=self.json)

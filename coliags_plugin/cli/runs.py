@@ -72,15 +72,13 @@ class EvaluateCommand(RunCommand, options.EvaluateOptions):
 
     def run(self) -> None:
         """Evaluate and print a table."""
-        from coliags_plugin.results.reading import means_summary
-
         run = self.opened()
         result = run.evaluate(self)
         name = result.evaluation_name
         shown = () if name == "paper" else ("--protocol", name)
         print_summary(
             str(result),
-            means_summary(result),
+            result.summary(),
             written=[run.folder.evaluations / name / "metrics.json"],
             then=[coliags("report", self.path, *shown)],
             as_json=self.json,
@@ -146,12 +144,11 @@ class MeshCommand(RunCommand, options.MeshOptions):
     def run(self) -> None:
         """Make the mesh, and print the comparison."""
         from coliags_plugin.reporting.text_formats import terminal_text
-        from coliags_plugin.surface.meshing.fusion import comparison_blocks
 
         meshed = self.opened().mesh(self)
         compared = meshed.comparison
         print_summary(
-            "" if compared is None else terminal_text(comparison_blocks(compared)),
+            terminal_text(meshed.comparison_blocks()),
             {"comparison": None if compared is None else compared.as_json()},
             written=[meshed.folder],
             then=[view_command(self.path, self.data)],

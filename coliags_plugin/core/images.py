@@ -192,3 +192,25 @@ def write_image(path: Path, pixels: np.ndarray) -> None:
 def write_mask(path: Path, mask: np.ndarray) -> None:
     """Write a mask as one channel of 8 bits: 255 where it is True, 0 elsewhere."""
     write_image(path, mask.astype(np.uint8) * 255)
+
+
+#: Brightness (of 255) from which a pixel is a highlight, and how many times as bright as its surroundings one is.
+HIGHLIGHT_LEVEL, HIGHLIGHT_RATIO = 250, 1.5
+
+
+def highlights(
+    image: UInt8[np.ndarray, "H W 3"], level: int = HIGHLIGHT_LEVEL, ratio: float = HIGHLIGHT_RATIO
+) -> Bool[np.ndarray, "H W"]:
+    """Mask of specular highlights: pixels that are saturated or much brighter than their surroundings. [H, W]
+
+    Nothing is a highlight where ``level`` is above 255.
+    """
+    import cv2
+
+    brightest = image.max(axis=2)
+    if level > 255:
+        return np.zeros(brightest.shape, bool)
+    # The window is wide enough that a highlight never fills half of it.
+    surroundings = cv2.medianBlur(brightest, 2 * (max(image.shape[:2]) // 25) + 1).astype(np.float32)
+    is_outlier = brightest > np.maximum(surroundings * ratio, surroundings + 20.0)
+    return np.asarray((brightest >= level) | is_outlier)

@@ -32,7 +32,7 @@ from coliags_plugin.reporting.colormaps import (
 )
 from coliags_plugin.reporting.image_files import eight_bit, read_depth_tiff, write_depth_tiff, write_png
 from coliags_plugin.results.hashing import code_key, metrics_sha256, plain_config, result_key
-from coliags_plugin.results.reading import RESULT_FILE, means_summary, per_frame_table, write_result
+from coliags_plugin.results.reading import RESULT_FILE, per_frame_table, write_result
 from coliags_plugin.results.record import (
     REFINED_SUFFIXES,
     CostRecord,
@@ -89,7 +89,7 @@ def evaluate(trained: TrainedRun, protocol_name: str, other: Scene | None = None
         _write_depth_pictures(scratch, scene.length_unit)
         result = _result(trained, scorer, evaluated, meter, truth)
         write_result(scratch / RESULT_FILE, result)
-        write_json(scratch / "metrics.json", means_summary(result))
+        write_json(scratch / "metrics.json", result.summary())
         atomic_write(scratch / "per_frame.csv", per_frame_table(result))
     return result
 

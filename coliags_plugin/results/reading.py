@@ -17,7 +17,7 @@ from coliags_plugin.core.json_files import read_json
 from coliags_plugin.core.settings import invalid_reported
 from coliags_plugin.reporting.numbers import Direction, duration
 from coliags_plugin.results.hashing import metrics_sha256
-from coliags_plugin.results.record import FORMAT, SEEN_SUFFIX, VERSION, CostRecord, Result
+from coliags_plugin.results.record import FORMAT, VERSION, CostRecord, Result
 
 #: Name of the results file in the folder of an evaluation.
 RESULT_FILE = "result.json"
@@ -100,32 +100,6 @@ def _files(path: Path) -> list[Path]:
             f"{path} holds no results", "results files, as `coliags eval` writes them", "Run `coliags eval RUN` first"
         )
     return matches
-
-
-def means_summary(result: Result) -> dict[str, Any]:
-    """Content of ``metrics.json``: means per test set, those of the main set also at the top, with their reasons."""
-    main = result.sets[result.main_set]
-    over_seen_pixels = {f"{name}{SEEN_SUFFIX}" for name in result.metrics}
-    reasons: dict[str, str] = {}
-    for part in reversed(result.sets.values()):
-        reasons |= part.reasons
-    return {
-        "protocol": result.protocol.model_dump(),
-        "method": result.method,
-        "scene": result.scene.name,
-        "step": result.steps,
-        "untrained_views": result.provenance.get("untrained_views", {}),
-        **{name: result.provenance[name] for name in ("held_out_used", "learned") if name in result.provenance},
-        **{name: main.mean(name) for name in result.metrics if name not in over_seen_pixels},
-        "reasons": reasons,
-        "directions": {name: metric.direction for name, metric in result.metrics.items()},
-        "units": {name: metric.unit for name, metric in result.metrics.items()},
-        "sets": {
-            name: {"frames": len(part.frames), **{metric: part.mean(metric) for metric in result.metrics}}
-            for name, part in result.sets.items()
-        },
-        "software": result.software,
-    }
 
 
 @dataclass(frozen=True)

@@ -212,6 +212,31 @@ class Result(_Part):
             f"protocol {self.protocol.name} v{self.protocol.version}"
         )
 
+    def summary(self) -> dict[str, Any]:
+        """Content of ``metrics.json``: means per test set, those of the main set also at the top, with their reasons."""
+        main = self.sets[self.main_set]
+        over_seen_pixels = {f"{name}{SEEN_SUFFIX}" for name in self.metrics}
+        reasons: dict[str, str] = {}
+        for part in reversed(self.sets.values()):
+            reasons |= part.reasons
+        return {
+            "protocol": self.protocol.model_dump(),
+            "method": self.method,
+            "scene": self.scene.name,
+            "step": self.steps,
+            "untrained_views": self.provenance.get("untrained_views", {}),
+            **{name: self.provenance[name] for name in ("held_out_used", "learned") if name in self.provenance},
+            **{name: main.mean(name) for name in self.metrics if name not in over_seen_pixels},
+            "reasons": reasons,
+            "directions": {name: metric.direction for name, metric in self.metrics.items()},
+            "units": {name: metric.unit for name, metric in self.metrics.items()},
+            "sets": {
+                name: {"frames": len(part.frames), **{metric: part.mean(metric) for metric in self.metrics}}
+                for name, part in self.sets.items()
+            },
+            "software": self.software,
+        }
+
     def table(self) -> DisplayTable:
         """Means of the metrics that a test set has, over every test set, with the reasons of those that are missing."""
         rows: list[dict[str, Value]] = [

@@ -26,7 +26,7 @@ from coliags_plugin.engine.trained import load_trained
 from coliags_plugin.metrics.pixels import PSNR
 from coliags_plugin.metrics.protocols import PaperProtocol
 from coliags_plugin.results.hashing import code_key, result_key
-from coliags_plugin.results.reading import RESULT_FILE, means_summary, per_frame_table, read_result
+from coliags_plugin.results.reading import RESULT_FILE, per_frame_table, read_result
 from tests.engine.test_trainer import kill, make_trainer
 from tests.scenes import SMALL, plain_frame, wall_scene
 
@@ -92,7 +92,7 @@ def test_it_says_what_the_run_was_and_cost(result, whole, scene):
     assert (result.scene.name, result.scene.size) == ("wall", (32, 24))
     assert (result.software["package_version"], result.software["code"]) == (__version__, code_key())
     assert result.provenance["training"]["renderer"] == "cpu"
-    assert result.provenance["held_out_used"] == means_summary(result)["held_out_used"] == {"points": ["0000"]}
+    assert result.provenance["held_out_used"] == result.summary()["held_out_used"] == {"points": ["0000"]}
     cost, last = result.cost, whole.run.log_rows(STEPS)[-1]
     assert cost.device == cost.render_device == device_name(CPU)
     assert cost.threads == cost.render_threads == torch.get_num_threads()
@@ -143,13 +143,13 @@ def test_refined_poses_add_metrics_and_change_no_other(result, loaded):
         assert refined_part.predictions_sha256 == part.predictions_sha256
         assert all(None not in refined_part.values[key] for key in added)
     assert other_result.metrics["psnr_pose_refined"] == result.metrics["psnr"] and other_result.key != result.key
-    assert means_summary(other_result)["psnr_pose_refined"] == other_result.mean("psnr_pose_refined")
+    assert other_result.summary()["psnr_pose_refined"] == other_result.mean("psnr_pose_refined")
 
 
 def test_the_other_files_are_made_of_it(result, whole):
     folder = whole.run.evaluation("paper")
     assert read_result(folder / RESULT_FILE) == result
-    assert json.loads((folder / "metrics.json").read_text()) == json.loads(json.dumps(means_summary(result)))
+    assert json.loads((folder / "metrics.json").read_text()) == json.loads(json.dumps(result.summary()))
     assert (folder / "per_frame.csv").read_text() == per_frame_table(result)
 
 

@@ -15,6 +15,7 @@ from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.images import highlights
 from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.geometry.lenses.models import LENSES
 from coliags_plugin.geometry.poses.colmap import posed_model
@@ -23,7 +24,6 @@ from coliags_plugin.reconstruction.structure.features import (
     Features,
     alike_pairs,
     epipolar_inliers,
-    highlights,
     mutual_matches,
     usable,
 )
@@ -296,9 +296,9 @@ def test_highlights_and_masks_yield_no_features():
     image[20:24, 30:34] = 200  # twice as bright as its surroundings
     image[50:52, 60:62] = 255
     image[:, :10] = 118  # brighter, not by enough
-    columns = np.nonzero(highlights(image, FeatureSettings()))[1]
+    columns = np.nonzero(highlights(image))[1]
     np.testing.assert_array_equal(np.unique(columns), [30, 31, 32, 33, 60, 61])
-    assert not highlights(image, FeatureSettings(highlight_level=256)).any()
+    assert not highlights(image, level=256).any()
     mask = np.ones((60, 80), bool)
     mask[:, 70:] = False
     free = usable(image, mask, FeatureSettings(margin=2))

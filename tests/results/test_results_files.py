@@ -16,7 +16,6 @@ from coliags_plugin.results import hashing
 from coliags_plugin.results.hashing import ArraysHash, code_key, metrics_sha256, result_key
 from coliags_plugin.results.reading import (
     find_results,
-    means_summary,
     per_frame_table,
     read_result,
     write_result,
@@ -168,15 +167,15 @@ def test_what_cannot_be_written_is_refused():
 
 def test_means_are_over_the_frames_that_have_a_value():
     main_set, other = made_set(), made_set(psnr=(20.0, 20.0))
-    summary = means_summary(made_result({"rotation": other, "test": main_set}))
+    summary = made_result({"rotation": other, "test": main_set}).summary()
     assert summary["psnr"] == 30.75 and summary["depth_mse"] == 0.25 and summary["lpips"] is None
     assert summary["reasons"] == {"lpips": "no weights"}
     assert "psnr_seen" not in summary and summary["sets"]["test"]["psnr_seen"] is None
-    assert means_summary(made_result({"rotation": other, "up": main_set}))["psnr"] == 20.0, (
+    assert made_result({"rotation": other, "up": main_set}).summary()["psnr"] == 20.0, (
         "the first, without one of that name"
     )
     metrics = {**METRICS, "foreseen_seen": METRICS["lpips"]}
-    assert "foreseen_seen" in means_summary(made_result(metrics=metrics)), "it has no foreseen beside it"
+    assert "foreseen_seen" in made_result(metrics=metrics).summary(), "it has no foreseen beside it"
 
 
 def test_the_table_has_every_frame_and_metric():

@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 
 from coliags_plugin.core.arrays import dilated
 from coliags_plugin.core.cameras import Camera
+from coliags_plugin.core.images import highlights
 from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.core.jobs import Progress, with_progress
 from coliags_plugin.core.scenes import Frame
@@ -83,23 +84,10 @@ def feature_extractor(settings: FeatureSettings) -> Extractor:
 
 def usable(image: Image, mask: Mask | None, settings: FeatureSettings) -> Mask:
     """Pixels where features are accepted: neither masked nor near a highlight."""
-    excluded = highlights(image, settings)
+    excluded = highlights(image, settings.highlight_level, settings.highlight_ratio)
     if mask is not None:
         excluded |= ~mask
     return ~dilated(excluded, settings.margin)
-
-
-def highlights(image: Image, settings: FeatureSettings) -> Mask:
-    """Specular highlights: pixels that are saturated or much brighter than their surroundings."""
-    import cv2
-
-    brightest = image.max(axis=2)
-    if settings.highlight_level > 255:
-        return np.zeros(brightest.shape, bool)
-    # The window is wide enough that a highlight never fills half of it.
-    surroundings = cv2.medianBlur(brightest, 2 * (max(image.shape[:2]) // 25) + 1).astype(np.float32)
-    is_outlier = brightest > np.maximum(surroundings * settings.highlight_ratio, surroundings + 20.0)
-    return np.asarray((brightest >= settings.highlight_level) | is_outlier)
 
 
 #: glog's level FATAL.

@@ -16,11 +16,12 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int64, UInt8
 
 from coliags_plugin.core.arrays import dilated
+from coliags_plugin.core.images import highlights
 from coliags_plugin.core.jobs import Progress, with_progress
-from coliags_plugin.reconstruction.structure.features import epipolar_inliers, highlights
+from coliags_plugin.reconstruction.structure.features import epipolar_inliers
 from coliags_plugin.reconstruction.structure.image_files import Image, Mask, Masks, mask_of, read_image
 from coliags_plugin.reconstruction.structure.mapping import brightness_at
-from coliags_plugin.reconstruction.structure.sfm_settings import FeatureSettings, TrackSettings
+from coliags_plugin.reconstruction.structure.sfm_settings import TrackSettings
 
 #: A grey image, and points in an image: columns and rows.
 Gray = UInt8[np.ndarray, "h w"]
@@ -54,7 +55,7 @@ def wall_textures(image: Image, mask: Mask | None = None) -> tuple[Gray, Gray, M
     """
     import cv2
 
-    glints = dilated(highlights(image, FeatureSettings()), _MARGIN)
+    glints = dilated(highlights(image), _MARGIN)
     excluded = glints if mask is None else glints | ~mask
     log = np.log(0.7 * image[..., 1].astype(np.float32) + 0.3 * image[..., 0] + _DARK_OFFSET)
     weight = (~excluded).astype(np.float32)

@@ -13,6 +13,7 @@ from pydantic import Field, model_validator
 from typing_extensions import Self
 
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.images import HIGHLIGHT_LEVEL, HIGHLIGHT_RATIO
 from coliags_plugin.core.settings import Settings
 from coliags_plugin.geometry.lenses.models import LENSES, FisheyeLens, Lens
 
@@ -35,10 +36,13 @@ class FeatureSettings(Settings):
         "about 20 degrees between matched images.",
     )
     highlight_level: int = Field(
-        default=250, ge=1, le=256, description="Brightness (of 255) from which a pixel is a highlight; 256: none is."
+        default=HIGHLIGHT_LEVEL,
+        ge=1,
+        le=256,
+        description="Brightness (of 255) from which a pixel is a highlight; 256: none is.",
     )
     highlight_ratio: float = Field(
-        default=1.5,
+        default=HIGHLIGHT_RATIO,
         gt=1.0,
         description="A pixel this many times as bright as its surroundings, and brighter by at least 20 of 255, is "
         "also a highlight; highlights move with the light source.",

@@ -92,6 +92,36 @@ class MeshedRun:
     mesh: TriangleMesh  # world of the poses, scene units
     comparison: SurfaceComparison | None  # with the true surface, where there is one
 
+    def comparison_blocks(self) -> list[Block]:
+        """The figures of the comparison as two tables and a few sentences; empty without a comparison."""
+        compared = self.comparison
+        if compared is None:
+            return []
+        unit = compared.unit
+        directions = {
+            "accuracy: mesh to true surface": compared.accuracy,
+            "completeness: seen to mesh": compared.completeness,
+        }
+        distances = [
+            [name, f"{d.mean:.3f}", f"{d.median:.3f}", f"{d.percentile_95:.3f}"] for name, d in directions.items()
+        ]
+        shares = [
+            [f"{score.threshold:g} {unit}", f"{score.precision:.4f}", f"{score.recall:.4f}", f"{score.f:.4f}"]
+            for score in compared.scores
+        ]
+        return [
+            simple_table([unit, "mean", "median", "95 %"], distances),
+            simple_table(["within", "precision", "recall", "F"], shares),
+            Paragraph(
+                f"Chamfer distance (mean of both means) {compared.chamfer:.3f} {unit}, "
+                f"HD95 {compared.hausdorff_95:.3f} {unit}, normals {compared.normal_error:.1f} degrees off"
+            ),
+            Paragraph(
+                f"seen: {compared.seen_area:.0f} {unit}^2 ({compared.seen_by}); "
+                f"{compared.beyond_seen:.1%} of the mesh lies beyond it"
+            ),
+        ]
+
 
 def mesh_run(
     trained: TrainedRun,
@@ -186,29 +216,3 @@ def _write_comparison(folder: Path, mesh: TriangleMesh, truth: TrueSurface, scen
     shown[truth.mesh.triangles[truth.seen]] = True
     gaps = distance_colors(mesh.rays.nearest(truth.mesh.vertices)[0], shown)
     write_mesh(folder / "truth_error.ply", replace(truth.mesh, colors=gaps))
-
-
-def comparison_blocks(compared: SurfaceComparison) -> list[Block]:
-    """The figures of a comparison as two tables and a few sentences."""
-    unit = compared.unit
-    directions = {
-        "accuracy: mesh to true surface": compared.accuracy,
-        "completeness: seen to mesh": compared.completeness,
-    }
-    distances = [[name, f"{d.mean:.3f}", f"{d.median:.3f}", f"{d.percentile_95:.3f}"] for name, d in directions.items()]
-    shares = [
-        [f"{score.threshold:g} {unit}", f"{score.precision:.4f}", f"{score.recall:.4f}", f"{score.f:.4f}"]
-        for score in compared.scores
-    ]
-    return [
-        simple_table([unit, "mean", "median", "95 %"], distances),
-        simple_table(["within", "precision", "recall", "F"], shares),
-        Paragraph(
-            f"Chamfer distance (mean of both means) {compared.chamfer:.3f} {unit}, "
-            f"HD95 {compared.hausdorff_95:.3f} {unit}, normals {compared.normal_error:.1f} degrees off"
-        ),
-        Paragraph(
-            f"seen: {compared.seen_area:.0f} {unit}^2 ({compared.seen_by}); "
-            f"{compared.beyond_seen:.1%} of the mesh lies beyond it"
-        ),
-    ]

@@ -19,6 +19,7 @@ from torch import Tensor
 from coliags_plugin.core.arrays import dilated
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.images import highlights
 from coliags_plugin.core.libraries import import_open3d
 from coliags_plugin.core.scenes import Frame, Scene
 from coliags_plugin.core.settings import Settings
@@ -27,8 +28,6 @@ from coliags_plugin.engine.held_light import held_light, render_held
 from coliags_plugin.engine.rendering import render_view
 from coliags_plugin.engine.trained import TrainedRun
 from coliags_plugin.geometry.meshes.mesh import Texture, TriangleMesh
-from coliags_plugin.reconstruction.structure.features import highlights, image_and_mask
-from coliags_plugin.reconstruction.structure.sfm_settings import FeatureSettings
 from coliags_plugin.reporting.image_files import eight_bit
 
 
@@ -152,7 +151,7 @@ def rendered_depth(trained: TrainedRun, settings: MeshSettings) -> Iterator[Dept
 
 def trust(frame: Frame) -> Float[Tensor, "H W"]:
     """Trust that the pixels of a frame show the wall: the confidence of its depth, and little at highlights. [H, W]"""
-    glints = torch.from_numpy(dilated(highlights(image_and_mask(frame)[0], FeatureSettings()), _MARGIN))
+    glints = torch.from_numpy(dilated(highlights(frame.image.cpu().numpy()), _MARGIN))
     confidence = 1.0 if frame.depth_confidence is None else frame.depth_confidence.cpu()
     return torch.where(glints, _GLINT, 1.0) * confidence
 

@@ -18,7 +18,7 @@ from coliags_plugin.core.scenes import PointCloud
 from coliags_plugin.geometry.meshes.mesh import TriangleMesh, read_mesh, write_mesh
 from coliags_plugin.reporting.text_formats import terminal_text
 from coliags_plugin.surface.meshing import views
-from coliags_plugin.surface.meshing.fusion import comparison_blocks, first_hits, fuse_run, mesh_run
+from coliags_plugin.surface.meshing.fusion import first_hits, fuse_run, mesh_run
 from coliags_plugin.surface.meshing.views import (
     MeshSettings,
     best_texture,
@@ -194,7 +194,7 @@ def test_files_and_figures(truth, tmp_path):
     assert summary["comparison"]["scores"][1]["f"] == compared.f_at(1.0) > 0.98
     assert compared.accuracy.mean < 0.01 and compared.normal_error < 1.0
     assert "cast" in compared.seen_by
-    assert f"{compared.chamfer:.3f} mm" in terminal_text(comparison_blocks(compared))
+    assert f"{compared.chamfer:.3f} mm" in terminal_text(meshed.comparison_blocks())
     errors = read_mesh(meshed.folder / "truth_error.ply")
     corner = np.abs(errors.vertices[:, :2]).min(axis=1) > 29
     assert (errors.colors[corner] == 128).all(), "what was not seen is grey"
@@ -268,9 +268,9 @@ def test_a_scene_of_unknown_scale(truth, tmp_path):
     assert meshed.comparison.unit == "mm", "the unit that the scene shares with that of the truth"
     assert json.loads((meshed.folder / "mesh.json").read_text())["unit"] == "unknown"
     write_unit(folder, "unknown")
-    compared = mesh_run(run, tmp_path / "unknown", SETTINGS, formats=("ply",), truth=folder).comparison
-    printed = terminal_text(comparison_blocks(compared))
-    assert f"{compared.chamfer:.3f} units" in printed and "mm" not in printed
+    meshed = mesh_run(run, tmp_path / "unknown", SETTINGS, formats=("ply",), truth=folder)
+    printed = terminal_text(meshed.comparison_blocks())
+    assert f"{meshed.comparison.chamfer:.3f} units" in printed and "mm" not in printed
     elsewhere = [replace(frame, camera=camera_at(index, 3.0, 0.0, 160, 120)) for index, frame in enumerate(scene.train)]
     other = exact_run(scene=replace(scene, train=elsewhere))
     with pytest.raises(InputError, match="same poses"):
