@@ -34,8 +34,8 @@ from torch import Tensor
 from train_stages import Handed
 from tube import camera, lining, wall
 
-from coliags_plugin.config.components import make_component
 from coliags_plugin.contracts import Renderer
+from coliags_plugin.core.components import make_component
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.gaussians import Gaussians
 from coliags_plugin.engine.devices import choose_device

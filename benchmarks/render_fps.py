@@ -19,8 +19,8 @@ import tyro
 from machine import show, size_of
 from tube import tube_scene
 
-from coliags_plugin.config.components import make_component
 from coliags_plugin.config.method_config import load_method
+from coliags_plugin.core.components import make_component
 from coliags_plugin.engine.devices import choose_device
 from coliags_plugin.renderers.splatting import choose_renderer
 

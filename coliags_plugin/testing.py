@@ -29,10 +29,10 @@ from torch import Tensor
 
 from coliags_plugin.checks.method import CPU, CheckContext, components, difference, name_of_check
 from coliags_plugin.checks.results import CheckFailedError, CheckSkippedError, fail_if
-from coliags_plugin.config.components import make_component
 from coliags_plugin.config.method_config import LoadedMethod, load_method
 from coliags_plugin.config.options import RenderOptions
 from coliags_plugin.core.cameras import Camera
+from coliags_plugin.core.components import make_component
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.render_output import DEPTH_KINDS
 from coliags_plugin.core.scenes import Frame, PointCloud, Scene, View

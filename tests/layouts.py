@@ -10,11 +10,11 @@ import math
 import numpy as np
 import OpenEXR
 
-from coliags_plugin.config.registry import phantom_layouts
 from coliags_plugin.core.arrays import read_arrays
 from coliags_plugin.core.files import atomic_write, write_arrays, write_json
 from coliags_plugin.core.images import write_image, write_mask
 from coliags_plugin.core.ply import point_properties, write_ply
+from coliags_plugin.core.registry import phantom_layouts
 from coliags_plugin.core.scene_files import write_unit
 from coliags_plugin.datamanagers.c3vd import CANDIDATE_LENS, INTRINSICS, ORDER
 from coliags_plugin.datamanagers.c3vd_endogslam import OPTIMIZED, PARAMS, PREPARED_DEPTH, PREPARED_PINHOLE, SH0

@@ -22,7 +22,7 @@ from coliags_plugin.cli.methods import CheckCommand, ConfigCommand
 from coliags_plugin.cli.runs import TrainCommand
 from coliags_plugin.cli.scenes import PhantomCommand
 from coliags_plugin.config.method_config import MethodConfig, OptimizerSettings, ScheduleSettings, load_method
-from coliags_plugin.config.registry import REGISTRIES
+from coliags_plugin.core.registry import REGISTRIES
 from coliags_plugin.core.render_output import OUTPUTS
 from coliags_plugin.core.splits import held_out
 from coliags_plugin.engine.samplers import PURPOSES

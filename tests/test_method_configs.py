@@ -6,8 +6,8 @@ from contextlib import nullcontext
 
 import pytest
 
-from coliags_plugin.config.components import is_auto
 from coliags_plugin.config.method_config import load_method, method_files, method_folder
+from coliags_plugin.core.components import is_auto
 from coliags_plugin.testing import METHOD_CHECKS, CheckContext, CheckSkippedError, name_of_check
 
 METHODS = sorted(name for name, path in method_files().items() if path.is_relative_to(method_folder()))

@@ -15,10 +15,9 @@ import torch
 from torch import Tensor
 
 from coliags_plugin.checks.results import CheckFailedError, CheckResult, CheckSkippedError, fail_if, run_check
-from coliags_plugin.config import registry
-from coliags_plugin.config.components import is_auto, make_component
-from coliags_plugin.core import __version__
+from coliags_plugin.core import __version__, registry
 from coliags_plugin.core.cameras import Camera
+from coliags_plugin.core.components import is_auto, make_component
 from coliags_plugin.core.errors import UnavailableError
 from coliags_plugin.core.gaussians import Gaussians
 from coliags_plugin.core.render_output import OUTPUTS

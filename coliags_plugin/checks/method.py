@@ -17,9 +17,9 @@ import torch
 from torch import Tensor
 
 from coliags_plugin.checks.results import CheckResult, CheckSkippedError, fail_if, run_check
-from coliags_plugin.config import registry
-from coliags_plugin.config.components import Component
 from coliags_plugin.config.method_config import LoadedMethod, MethodConfig, load_method, method_tree
+from coliags_plugin.core import registry
+from coliags_plugin.core.components import Component
 from coliags_plugin.core.errors import InputError, InterruptedRunError, ReportedError
 from coliags_plugin.core.scenes import Scene
 from coliags_plugin.engine.checkpoints import Checkpoint, checkpoint_folder, read_checkpoint

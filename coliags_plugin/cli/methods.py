@@ -31,8 +31,8 @@ class ListCommand:
         """Print names by kind, with the source of those that are not built in."""
         from coliags_plugin.comparison.named_files import ABLATIONS, shipped
         from coliags_plugin.config.method_config import descriptions, method_files
-        from coliags_plugin.config.registry import REGISTRIES
         from coliags_plugin.core.errors import check_name
+        from coliags_plugin.core.registry import REGISTRIES
 
         def sources(kind: str) -> dict[str, str]:
             named = {name: REGISTRIES[kind].source(name) for name in REGISTRIES[kind]}

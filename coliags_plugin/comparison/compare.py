@@ -15,9 +15,9 @@ from coliags_plugin.comparison.named_files import Variant
 from coliags_plugin.comparison.plan import ComparisonCell, FailureRecord, make_cells
 from coliags_plugin.comparison.scenes import find_scenes, make_phantoms
 from coliags_plugin.comparison.worker import CellTask
-from coliags_plugin.config import registry
 from coliags_plugin.config.method_config import is_path, method_name
 from coliags_plugin.config.options import CompareOptions
+from coliags_plugin.core import registry
 from coliags_plugin.core.errors import InputError, InterruptedRunError, check_name, check_number
 from coliags_plugin.core.files import user_path
 from coliags_plugin.core.scenes import Scene

@@ -11,9 +11,9 @@ from typing import Annotated, Any, TypeVar
 from pydantic import AfterValidator, Field, field_validator, model_validator
 from typing_extensions import Self
 
-from coliags_plugin.config import registry
 from coliags_plugin.config.method_config import BENCHMARKS, is_path, method_folder
 from coliags_plugin.config.yaml_tree import at_origins, dump_inline, read_tree
+from coliags_plugin.core import registry
 from coliags_plugin.core.errors import InputError, did_you_mean
 from coliags_plugin.core.files import user_path
 from coliags_plugin.core.settings import Settings

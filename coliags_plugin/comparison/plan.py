@@ -15,9 +15,9 @@ from pydantic import BaseModel, Field
 
 from coliags_plugin.comparison.named_files import Variant
 from coliags_plugin.comparison.scenes import SceneSource
-from coliags_plugin.config import registry
 from coliags_plugin.config.method_config import MethodConfig, load_method
 from coliags_plugin.config.options import CompareOptions
+from coliags_plugin.core import registry
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.json_files import read_json
 from coliags_plugin.core.settings import invalid_reported

@@ -11,11 +11,11 @@ from pathlib import Path
 
 from coliags_plugin.comparison.named_files import load_benchmark, shipped
 from coliags_plugin.config.method_config import is_path
-from coliags_plugin.config.registry import phantom_layouts
 from coliags_plugin.core.errors import InputError, check_name, did_you_mean
 from coliags_plugin.core.files import user_path
 from coliags_plugin.core.jobs import Progress, locked
 from coliags_plugin.core.json_files import json_text, parse_json
+from coliags_plugin.core.registry import phantom_layouts
 from coliags_plugin.phantom.generate import generate, resolve
 from coliags_plugin.phantom.settings import PhantomSettings
 

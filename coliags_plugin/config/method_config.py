@@ -12,8 +12,9 @@ from typing import Annotated, Any
 from pydantic import Field, field_validator, model_validator
 from typing_extensions import Self
 
-from coliags_plugin.config import registry
-from coliags_plugin.config.components import (
+from coliags_plugin.config.yaml_tree import Node, at_origins, dump, dump_inline, merge, override_all, read_tree
+from coliags_plugin.core import registry
+from coliags_plugin.core.components import (
     Component,
     DataManagerNode,
     FieldNode,
@@ -24,7 +25,6 @@ from coliags_plugin.config.components import (
     StrategyNode,
     make_component,
 )
-from coliags_plugin.config.yaml_tree import Node, at_origins, dump, dump_inline, merge, override_all, read_tree
 from coliags_plugin.core.errors import InputError, did_you_mean
 from coliags_plugin.core.files import user_path
 from coliags_plugin.core.intrinsics import NEAR_PLANE

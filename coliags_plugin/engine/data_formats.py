@@ -8,11 +8,11 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from coliags_plugin.config import registry
-from coliags_plugin.config.components import Component, candidates, is_auto, named_component, with_options
 from coliags_plugin.config.method_config import LoadedMethod, MethodConfig, load_method, method_tree
 from coliags_plugin.config.yaml_tree import Node, override_all
 from coliags_plugin.contracts import DataManager
+from coliags_plugin.core import registry
+from coliags_plugin.core.components import Component, candidates, is_auto, named_component, with_options
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.jobs import Progress
 from coliags_plugin.core.scene_files import FRAME_SUFFIXES, files_in, inventory

@@ -7,11 +7,11 @@ from dataclasses import replace
 
 import torch
 
-from coliags_plugin.config.registry import fields
 from coliags_plugin.contracts import GaussianField
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError, check_name
 from coliags_plugin.core.lamps import FlattenedLight, HeldLight, Lamp, LightOfCamera
+from coliags_plugin.core.registry import fields
 from coliags_plugin.core.render_output import OPAQUE_ALPHA, RenderOutput
 from coliags_plugin.engine.model import Model
 from coliags_plugin.engine.trained import TrainedRun

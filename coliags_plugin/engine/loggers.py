@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 from uuid import uuid4
 
-from coliags_plugin.config import registry
 from coliags_plugin.config.yaml_tree import dump
 from coliags_plugin.contracts import Follower, Logger
+from coliags_plugin.core import registry
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.json_files import JsonObject, scalars
 

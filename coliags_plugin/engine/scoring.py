@@ -15,10 +15,10 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from coliags_plugin.config import registry
-from coliags_plugin.config.components import named_component
 from coliags_plugin.contracts import Comparison, Metric, Protocol
+from coliags_plugin.core import registry
 from coliags_plugin.core.cameras import Camera
+from coliags_plugin.core.components import named_component
 from coliags_plugin.core.errors import InputError, UnavailableError
 from coliags_plugin.core.render_output import BLANK_ALPHA, OPAQUE_ALPHA, RenderOutput
 from coliags_plugin.core.scenes import Frame

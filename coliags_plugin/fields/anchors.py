@@ -12,9 +12,9 @@ from pydantic import Field as Option
 from torch import Tensor, nn
 from typing_extensions import Self
 
-from coliags_plugin.config.components import AppearanceHeadNode, GeometryHeadNode
 from coliags_plugin.contracts import GaussianField, HeadNetworks, SeenAnchors
 from coliags_plugin.core.cameras import Camera
+from coliags_plugin.core.components import AppearanceHeadNode, GeometryHeadNode
 from coliags_plugin.core.gaussians import Gaussians
 from coliags_plugin.core.json_files import JsonObject
 from coliags_plugin.core.lamps import HeldLight

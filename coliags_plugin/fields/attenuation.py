@@ -9,9 +9,9 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from coliags_plugin.config.components import AppearanceHeadNode
 from coliags_plugin.contracts import AppearanceHead, HeadNetworks, SeenAnchors
 from coliags_plugin.core.cameras import Camera
+from coliags_plugin.core.components import AppearanceHeadNode
 from coliags_plugin.core.json_files import JsonObject
 from coliags_plugin.core.lamps import HeldLight
 from coliags_plugin.core.photometry import fit_light

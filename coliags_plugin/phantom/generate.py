@@ -15,13 +15,13 @@ import scipy.ndimage
 from jaxtyping import Bool, Float, Int, UInt8
 from scipy.spatial.transform import Rotation
 
-from coliags_plugin.config.registry import phantom_layouts
 from coliags_plugin.core import __version__
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_folder, reporting_unwritable, write_arrays, write_json
 from coliags_plugin.core.images import write_image
 from coliags_plugin.core.jobs import Progress
 from coliags_plugin.core.ply import point_properties, write_ply
+from coliags_plugin.core.registry import phantom_layouts
 from coliags_plugin.geometry.poses.alignment import umeyama
 from coliags_plugin.geometry.poses.trajectory import rigid
 from coliags_plugin.phantom.colon import (

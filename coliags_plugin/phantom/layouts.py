@@ -1,7 +1,7 @@
 """The folder layouts a phantom can be written in (docs/layouts): C3VD's, COLMAP's, nerfstudio's and TUM's.
 
 To add one, subclass :class:`Layout` in a module of its own and register it in
-:data:`coliags_plugin.config.registry.phantom_layouts`.
+:data:`coliags_plugin.core.registry.phantom_layouts`.
 """
 
 from __future__ import annotations

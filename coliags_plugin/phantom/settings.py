@@ -10,8 +10,8 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, Field, field_validator, model_validator
 from typing_extensions import Self
 
-from coliags_plugin.config.registry import phantom_layouts
 from coliags_plugin.config.yaml_tree import tuples
+from coliags_plugin.core.registry import phantom_layouts
 from coliags_plugin.core.settings import Settings, validated
 
 #: A colour matrix that changes nothing.

@@ -13,10 +13,10 @@ from jaxtyping import Float
 from torch import Tensor
 from typing_extensions import TypeVar
 
-from coliags_plugin.config import registry
-from coliags_plugin.config.components import Component, candidates, is_auto, with_options
 from coliags_plugin.contracts import GaussianField, Renderer
+from coliags_plugin.core import registry
 from coliags_plugin.core.cameras import Camera
+from coliags_plugin.core.components import Component, candidates, is_auto, with_options
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.gaussians import Gaussians
 from coliags_plugin.core.render_output import OUTPUTS, SURFEL_OUTPUTS, RenderOutput, Splats, check_outputs

@@ -213,7 +213,7 @@ class Result(_Part):
         )
 
     def summary(self) -> dict[str, Any]:
-        """Content of ``metrics.json``: means per test set, those of the main set also at the top, with their reasons."""
+        """Content of ``metrics.json``: means per test set, of the main set also at the top, with their reasons."""
         main = self.sets[self.main_set]
         over_seen_pixels = {f"{name}{SEEN_SUFFIX}" for name in self.metrics}
         reasons: dict[str, str] = {}

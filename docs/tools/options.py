@@ -25,7 +25,7 @@ from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
 from coliags_plugin.config.method_config import MethodConfig, OptimizerSettings, ScheduleSettings
-from coliags_plugin.config.registry import REGISTRIES, Registry
+from coliags_plugin.core.registry import REGISTRIES, Registry
 from coliags_plugin.core.settings import Settings
 from coliags_plugin.phantom.settings import PhantomSettings
 from coliags_plugin.pipeline.settings import FrameSettings, ReconstructionSettings
@@ -225,7 +225,7 @@ def _with_range(text: str, metadata: Any) -> str:
 
 
 def _kind_of(validator: PlainValidator) -> str | None:
-    """The kind of component that a node of coliags_plugin.config.components stands for."""
+    """The kind of component that a node of coliags_plugin.core.components stands for."""
     args = getattr(validator.func, "args", ())
     return args[0] if args and args[0] in REGISTRIES else None
 

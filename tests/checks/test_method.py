@@ -6,7 +6,7 @@ import re
 
 import pytest
 
-from coliags_plugin.config import registry
+from coliags_plugin.core import registry
 from coliags_plugin.testing import METHOD_CHECKS, CheckContext, name_of_check
 from tests.checks import components
 

@@ -11,7 +11,7 @@ import pytest
 
 from coliags_plugin.api.runs import Run
 from coliags_plugin.checks.results import CheckResult, line, summary
-from coliags_plugin.config import registry
+from coliags_plugin.core import registry
 from coliags_plugin.testing import METHOD_CHECKS, name_of_check
 from tests.commands import refused, run
 from tests.scenes import write_wall

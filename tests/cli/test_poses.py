@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from coliags_plugin.config.registry import pose_formats
 from coliags_plugin.config.yaml_tree import settings_of
 from coliags_plugin.core.images import write_image, write_mask
+from coliags_plugin.core.registry import pose_formats
 from coliags_plugin.core.scene_files import read_unit
 from coliags_plugin.engine.data_formats import open_scene
 from coliags_plugin.geometry.poses.formats import format_named, format_of, write_trajectory

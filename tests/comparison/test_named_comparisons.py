@@ -12,8 +12,8 @@ import pytest
 from coliags_plugin.comparison.named_files import ABLATIONS, load_ablation, load_benchmark, shipped
 from coliags_plugin.comparison.scenes import find_scenes
 from coliags_plugin.config.method_config import descriptions, load_method
-from coliags_plugin.config.registry import phantom_layouts
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.registry import phantom_layouts
 from coliags_plugin.phantom.generate import resolve
 
 

@@ -12,9 +12,9 @@ import yaml
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from coliags_plugin.config import registry
 from coliags_plugin.config.method_config import descriptions, load_method, method_files, method_folder
 from coliags_plugin.config.yaml_tree import assignments, parse_assignments, parse_tree, parse_value
+from coliags_plugin.core import registry
 from coliags_plugin.core.errors import InputError
 
 

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from coliags_plugin.api.scenes import load_scene
-from coliags_plugin.config.components import make_component
+from coliags_plugin.core.components import make_component
 from coliags_plugin.core.photometry import Cavity, fit_light
 from coliags_plugin.core.scenes import Frame, PointCloud
 from coliags_plugin.modules.exposure import FrameGain

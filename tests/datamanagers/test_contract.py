@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 import torch
 
-from coliags_plugin.config.registry import datamanagers
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.registry import datamanagers
 from coliags_plugin.core.scenes import Frame, Scene
 from coliags_plugin.engine.data_formats import find_format, formats, recognised
 from tests.datamanagers.kinds import (

@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 
 import tests.layouts  # noqa: F401  (registers them)
-from coliags_plugin.config.registry import datamanagers, phantom_layouts
 from coliags_plugin.core.intrinsics import Intrinsics
+from coliags_plugin.core.registry import datamanagers, phantom_layouts
 from coliags_plugin.core.scenes import Frame, Scene
 from coliags_plugin.datamanagers.recorded import RecordedDataManager
 from coliags_plugin.geometry.lenses.models import Lens, PinholeLens

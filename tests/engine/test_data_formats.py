@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 import tests.layouts  # noqa: F401  (registers them)
-from coliags_plugin.config import registry
-from coliags_plugin.config.components import make_component
+from coliags_plugin.core import registry
+from coliags_plugin.core.components import make_component
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.engine.data_formats import data_manager, find_format, load_method_for, open_scene
 

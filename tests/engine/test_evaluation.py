@@ -11,9 +11,9 @@ import pytest
 import torch
 
 from coliags_plugin import __version__
-from coliags_plugin.config import registry
 from coliags_plugin.config.method_config import load_method
 from coliags_plugin.contracts import Comparison
+from coliags_plugin.core import registry
 from coliags_plugin.core.errors import InputError, UnavailableError
 from coliags_plugin.core.provenance import Provenance, SplitRecord
 from coliags_plugin.core.scenes import SparseDepth

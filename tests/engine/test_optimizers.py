@@ -6,8 +6,8 @@ import pytest
 import torch
 from torch import nn
 
-from coliags_plugin.config.components import make_component
 from coliags_plugin.config.method_config import OptimizerSettings
+from coliags_plugin.core.components import make_component
 from coliags_plugin.core.scenes import concatenate_targets
 from coliags_plugin.engine.model import Model
 from coliags_plugin.engine.optimizers import Optimizers

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import torch
 
-from coliags_plugin.config.components import make_component
+from coliags_plugin.core.components import make_component
 from coliags_plugin.core.scenes import PointCloud
 from tests.scenes import wall_scene
 

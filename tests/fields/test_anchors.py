@@ -13,8 +13,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from coliags_plugin.config.components import make_component
 from coliags_plugin.contracts import SeenAnchors
+from coliags_plugin.core.components import make_component
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.lamps import FlattenedLight, LightOfCamera
 from coliags_plugin.core.scenes import PointCloud

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import torch
 
-from coliags_plugin.config import registry
 from coliags_plugin.contracts import Loss, Schedule, TrainingStep
+from coliags_plugin.core import registry
 from coliags_plugin.core.gaussians import Gaussians
 from coliags_plugin.core.render_output import RenderOutput, Splats
 

@@ -12,8 +12,8 @@ import pytest
 import torch
 from torch.nn.functional import grid_sample, huber_loss
 
-from coliags_plugin.config import registry
 from coliags_plugin.contracts import LossSettings
+from coliags_plugin.core import registry
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.render_output import RenderOutput, concatenate_pixels
 from coliags_plugin.core.scenes import SparseDepth, concatenate_targets

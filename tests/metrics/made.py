@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import torch
 
-from coliags_plugin.config import registry
 from coliags_plugin.contracts import Comparison
+from coliags_plugin.core import registry
 from coliags_plugin.metrics import lpips
 from coliags_plugin.metrics.lpips import TAPS
 

@@ -17,8 +17,8 @@ import numpy as np
 import pytest
 import torch
 
-from coliags_plugin.config.registry import REGISTRIES
 from coliags_plugin.core.errors import InputError, UnavailableError
+from coliags_plugin.core.registry import REGISTRIES
 from coliags_plugin.metrics import lpips
 from coliags_plugin.metrics.lpips import (
     BACKBONE_FILES,

@@ -13,8 +13,8 @@ from scipy.ndimage import maximum_filter, minimum_filter
 from scipy.optimize import minimize_scalar
 from skimage.metrics import mean_squared_error, peak_signal_noise_ratio
 
-from coliags_plugin.config import registry
 from coliags_plugin.contracts import Comparison
+from coliags_plugin.core import registry
 from coliags_plugin.core.errors import UnavailableError
 from coliags_plugin.core.scenes import SparseDepth
 from coliags_plugin.core.ssim import ssim

@@ -7,7 +7,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from coliags_plugin.config import registry
+from coliags_plugin.core import registry
 from coliags_plugin.core.errors import UnavailableError
 from coliags_plugin.core.render_output import OUTPUTS
 from coliags_plugin.metrics.protocols import through_8_bit, through_16_bit

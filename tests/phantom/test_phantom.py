@@ -17,8 +17,8 @@ import torch
 
 from coliags_plugin.api.scenes import load_scene
 from coliags_plugin.comparison.named_files import load_benchmark
-from coliags_plugin.config.registry import datamanagers, phantom_layouts
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.registry import datamanagers, phantom_layouts
 from coliags_plugin.engine.data_formats import find_format
 from coliags_plugin.geometry.lenses.models import PinholeLens
 from coliags_plugin.geometry.meshes.mesh import TriangleMesh, read_mesh

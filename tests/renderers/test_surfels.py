@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from coliags_plugin.config import registry
+from coliags_plugin.core import registry
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.render_output import OUTPUTS
 from coliags_plugin.engine.model import Model

@@ -9,10 +9,10 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from coliags_plugin.config import registry
-from coliags_plugin.config.components import make_component
 from coliags_plugin.contracts import Availability, GaussianField
+from coliags_plugin.core import registry
 from coliags_plugin.core.cameras import Camera
+from coliags_plugin.core.components import make_component
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.gaussians import Gaussians
 from coliags_plugin.core.render_output import OUTPUTS as ALL_OUTPUTS

@@ -8,9 +8,9 @@ from functools import partial
 import pytest
 import torch
 
-from coliags_plugin.config.components import make_component
 from coliags_plugin.config.method_config import OptimizerSettings
 from coliags_plugin.contracts import Schedule, TrainingStep
+from coliags_plugin.core.components import make_component
 from coliags_plugin.core.gaussians import Gaussians, rotation_matrices
 from coliags_plugin.core.render_output import RenderOutput, Splats
 from coliags_plugin.engine.model import Model

@@ -1,4 +1,4 @@
-"""Pose file formats (:data:`coliags_plugin.config.registry.pose_formats`): detection, writing, and parts of readers."""
+"""Pose file formats (:data:`coliags_plugin.core.registry.pose_formats`): detection, writing, and parts of readers."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
-from coliags_plugin.config.registry import pose_formats
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import refuse_existing
+from coliags_plugin.core.registry import pose_formats
 from coliags_plugin.core.text_files import encoding_of, shortened, text_lines, unreadable
 from coliags_plugin.geometry.poses.trajectory import Trajectory
 

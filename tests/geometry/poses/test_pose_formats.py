@@ -11,9 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from coliags_plugin.config.registry import pose_formats
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.intrinsics import Intrinsics
+from coliags_plugin.core.registry import pose_formats
 from coliags_plugin.geometry.poses import endogslam
 from coliags_plugin.geometry.poses.alignment import align, associate, umeyama
 from coliags_plugin.geometry.poses.formats import format_named, format_of, write_trajectory

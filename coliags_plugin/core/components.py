@@ -10,8 +10,8 @@ from typing import Annotated, Any
 from pydantic import PlainSerializer, PlainValidator
 from pydantic_core import PydanticCustomError
 
-from coliags_plugin.config.registry import REGISTRIES, Resolver
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.registry import REGISTRIES, Resolver
 from coliags_plugin.core.settings import Settings, invalid_reported
 
 

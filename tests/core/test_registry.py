@@ -6,9 +6,9 @@ from importlib import metadata
 
 import pytest
 
-from coliags_plugin.config import registry as registry_module
-from coliags_plugin.config.registry import REGISTRIES, Registry
+from coliags_plugin.core import registry as registry_module
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.registry import REGISTRIES, Registry
 
 #: Kinds that no config has options for.
 WITHOUT_SETTINGS = {"loggers", "protocols", "pose_formats", "phantom_layouts"}
