@@ -103,9 +103,11 @@ def twice(number):
 @pytest.fixture
 def cache(tmp_path, monkeypatch, caplog):
     """The folder that kernels made in this test are kept in."""
-    caplog.set_level(logging.INFO, compilation.__name__)
+    from coliags_plugin.core.numba_kernels import kernel_cache  # private classes of numba
+
+    caplog.set_level(logging.INFO, kernel_cache.__name__)
     monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path / "cache"))
-    monkeypatch.setattr(compilation, "_announced", set())
+    monkeypatch.setattr(kernel_cache, "_announced", set())
     return tmp_path / "cache"
 
 
@@ -163,6 +165,29 @@ def run_python(code, **environment):
     return subprocess.run(
         [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=False, timeout=600
     )
+
+
+def with_another_release(expression):
+    """The value of an expression of this module's names, by a process with a release of numba that is not tested."""
+    code = f"""
+import sys, numba
+numba.__version__ = "9.9.0"
+sys.modules["coliags_plugin.core.numba_kernels.kernel_cache"] = None  # its imports may fail
+from tests.renderers.test_cpu_renderer_machine import *
+print({expression})
+"""
+    process = run_python(code)
+    assert process.stderr.count("none of the tested releases") == 1, process.stderr
+    return process.stdout.strip()
+
+
+def test_kernels_compile_with_other_releases_of_numba():
+    assert with_another_release("factory(ten_more)(factory(one_more)(4))") == "15"
+
+
+@pytest.mark.thorough
+def test_gradients_are_the_same_with_other_releases_of_numba():
+    assert with_another_release("gradient(*view()).sum().item().hex()") == gradient(*view()).sum().item().hex()
 
 
 # --- threads and forks ------------------------------------------------------------------------------------------------
