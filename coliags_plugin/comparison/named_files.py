@@ -75,9 +75,9 @@ class Benchmark(Settings):
 
     description: str  # one line
     format: _DataFormat | None = None  # data manager of all scenes; null: recognised from the files
-    split: str | None = None  # of all scenes; null: the data manager's
+    split: str | None = None  # split of all scenes; null: the data manager's
     options: dict[str, Any] = Field(default_factory=dict)  # options of the data manager, for all scenes
-    scenes: dict[str, BenchmarkScene] = Field(min_length=1)  # by name
+    scenes: dict[str, BenchmarkScene] = Field(min_length=1)  # scenes by name
 
     @field_validator("scenes", mode="before")
     @classmethod
@@ -130,7 +130,7 @@ class AblationSettings(Settings):
 
     description: str  # one line
     base: str | None = None  # method of the variants that name none
-    variants: dict[str, VariantEntry] = Field(min_length=1)  # by name
+    variants: dict[str, VariantEntry] = Field(min_length=1)  # variants by name
 
     @field_validator("variants", mode="before")
     @classmethod

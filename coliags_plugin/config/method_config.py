@@ -56,7 +56,7 @@ class OptimizerSettings(Settings):
 class ScheduleSettings(Settings):
     """Length of training, and intervals of logging and checkpoints."""
 
-    steps: int = Field(default=30_000, ge=1)  # of the run
+    steps: int = Field(default=30_000, ge=1)  # length of the run
     written_for: int = Field(default=30_000, ge=1)  # run length that step numbers elsewhere in the config mean
     log_every: int = Field(default=10, ge=1)  # steps between lines of metrics.jsonl
     checkpoint_every: int = Field(default=5_000, ge=1)  # steps between checkpoints; the last step has one, too

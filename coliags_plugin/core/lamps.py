@@ -28,8 +28,10 @@ class Lamp(Settings):
     """
 
     offset: tuple[_Finite, _Finite, _Finite] = (0.0, 0.0, 0.0)  # from the optical centre, camera axes, scene units (mm)
-    turn: tuple[_Finite, _Finite] = (0.0, 0.0)  # of its axis from the optical axis, about camera x, then y, degrees
-    power: float = Option(default=0.0, ge=0.0, allow_inf_nan=False)  # see above; 0: alike in all directions
+    # turn of its axis from the optical axis, about camera x, then y, degrees
+    turn: tuple[_Finite, _Finite] = (0.0, 0.0)
+    # exponent of the cosine in the lamp's beam; 0: alike in all directions
+    power: float = Option(default=0.0, ge=0.0, allow_inf_nan=False)
     intensity: float = Option(default=1.0, ge=0.0, allow_inf_nan=False)  # factor of the trained intensity
 
     @property

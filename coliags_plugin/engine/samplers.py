@@ -36,7 +36,7 @@ class FrameSampler(Sampler):
 class PixelSamplerSettings(Settings):
     """Options of pixel batches."""
 
-    pixels: int = Field(default=1024, ge=1)  # in all
+    pixels: int = Field(default=1024, ge=1)  # number in a batch, of all its frames together
     frames: int = Field(default=4, ge=1)  # that they are taken from, as evenly as can be
 
 

@@ -73,7 +73,7 @@ class ReferenceNormals(nn.Module):
 class ExplicitFieldSettings(Settings):
     """Options of all fields of explicit Gaussians (docs/methods.md 7.1)."""
 
-    initial_opacity: float = Option(default=0.1, gt=0, lt=1)  # of every Gaussian
+    initial_opacity: float = Option(default=0.1, gt=0, lt=1)  # opacity of every Gaussian at the start
     # neighbours from which normals of the initial points are estimated, as references; null: no such normals
     normal_neighbours: int | None = Option(default=None, ge=3)
 
@@ -177,7 +177,7 @@ INVERSE_SQUARE = 2.0 / 2.2
 class ExplicitGaussiansSettings(ExplicitFieldSettings):
     """Options of explicit Gaussians (docs/methods.md 7.1)."""
 
-    sh_degree: int = Option(default=3, ge=0, le=spherical_harmonics.MAX_DEGREE)  # of the spherical harmonics
+    sh_degree: int = Option(default=3, ge=0, le=spherical_harmonics.MAX_DEGREE)  # degree of the spherical harmonics
     sh_every: int = Option(default=1000, ge=1)  # steps between increases of the active degree from 0
 
 

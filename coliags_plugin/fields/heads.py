@@ -21,7 +21,7 @@ class PlainGeometrySettings(Settings):
     """Options of the plain geometry head."""
 
     hidden: int = Field(default=32, ge=1)  # units of each hidden layer
-    # Of every child at the start; null: random, about half of an anchor's children are below 0 (docs/methods.md 3.4).
+    # Opacity of every child at the start; null: random, about half of the children are below 0 (docs/methods.md 3.4).
     initial_opacity: float | None = Field(default=None, gt=0, lt=1)
 
 
@@ -72,7 +72,7 @@ class PlainGeometryHead(GeometryHead[GeometryT]):
 class IMVEGeometrySettings(PlainGeometrySettings):
     """Options of IMVE."""
 
-    frequencies: int = Field(default=10, ge=0)  # of gamma, per component of the direction
+    frequencies: int = Field(default=10, ge=0)  # frequencies of gamma, per component of the direction
 
 
 class IMVEGeometryHead(PlainGeometryHead[IMVEGeometrySettings]):
@@ -99,7 +99,7 @@ class AppearanceSettings(Settings):
     """
 
     hidden: int = Field(default=32, ge=1)  # units of each hidden layer
-    bias_init: Literal["scene_distances", "pytorch"] = "scene_distances"  # see above
+    bias_init: Literal["scene_distances", "pytorch"] = "scene_distances"  # initial biases of hidden units
 
 
 #: Settings of an appearance head.
@@ -185,7 +185,7 @@ class PlainAppearanceHead(MLPAppearanceHead[PlainAppearanceSettings]):
 class IMIAAppearanceSettings(AppearanceSettings):
     """Options of IMIA."""
 
-    frequencies: int = Field(default=5, ge=0)  # of gamma, for the cosine
+    frequencies: int = Field(default=5, ge=0)  # frequencies of gamma, for the cosine
 
 
 class IMIAAppearanceHead(MLPAppearanceHead[IMIAAppearanceSettings]):

@@ -92,9 +92,9 @@ _MIN_DISTANCE = 1e-6
 class LitGaussiansSettings(ExplicitFieldSettings):
     """Options of lit Gaussians; the defaults are PR-Endo's (docs/rivals/pr-endo.md)."""
 
-    max_scale_share: float = Option(default=0.1, gt=0)  # of the extent: upper bound of all scales
-    pink_share: float = Option(default=0.5, ge=0, le=1)  # of the colour of mucosa in the initial albedo
-    initial_roughness: float = Option(default=0.5, ge=0, le=1)  # of every Gaussian
+    max_scale_share: float = Option(default=0.1, gt=0)  # upper bound of all scales, as a share of the extent
+    pink_share: float = Option(default=0.5, ge=0, le=1)  # share of the colour of mucosa in the initial albedo
+    initial_roughness: float = Option(default=0.5, ge=0, le=1)  # roughness of every Gaussian at the start
     initial_f0: float = Option(default=0.035, ge=0, le=1)  # reflectance of every Gaussian at normal incidence
     roughness_range: tuple[float, float] = (0.05, 0.7)  # bounds of the roughness
     f0_range: tuple[float, float] = (0.0, 0.035)  # bounds of the reflectance at normal incidence
@@ -103,8 +103,9 @@ class LitGaussiansSettings(ExplicitFieldSettings):
     lamp_exponent: float = Option(default=2.0, ge=0)  # initial p
     network_from: int = Option(default=1000, ge=0)  # step after which the network corrects the diffuse reflection
     hidden: int = Option(default=128, ge=1)  # units of each hidden layer of the network
-    hidden_layers: int = Option(default=3, ge=1)  # of the network
-    network_precision: Precision = "auto"  # of its products in training; auto: bfloat16 where the CPU is made for it
+    hidden_layers: int = Option(default=3, ge=1)  # hidden layers of the network
+    # precision of the network's products in training; auto: bfloat16 where the CPU is made for it
+    network_precision: Precision = "auto"
     input_noise: float = Option(default=0.001, ge=0)  # standard deviation, on the network's inputs while training
 
     @model_validator(mode="after")

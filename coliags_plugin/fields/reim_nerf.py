@@ -96,15 +96,16 @@ def surface_distances(scene: Scene) -> Float[Tensor, "2"]:
 class ReimNerfFieldSettings(Settings):
     """Options of REIM-NeRF's field (docs/rivals/reim-nerf.md); the coarse and the fine network are alike."""
 
-    layers: int = Option(default=8, ge=1)  # of the trunk, from position to density
-    width: int = Option(default=256, ge=1)  # of the trunk
+    layers: int = Option(default=8, ge=1)  # layers of the trunk, from position to density
+    width: int = Option(default=256, ge=1)  # units of a layer of the trunk
     skip: int | None = Option(default=4, ge=1)  # layer, from 0, that sees the embedded position again; null: none
-    color_width: int = Option(default=128, ge=1)  # of the layer between feature and colour
-    position_frequencies: int = Option(default=10, ge=0)  # of the embedding
-    direction_frequencies: int = Option(default=4, ge=0)  # of the embedding
-    light_frequencies: int = Option(default=4, ge=0)  # of the embedding
+    color_width: int = Option(default=128, ge=1)  # units of the layer between feature and colour
+    position_frequencies: int = Option(default=10, ge=0)  # frequencies of the embedding of the position
+    direction_frequencies: int = Option(default=4, ge=0)  # frequencies of the embedding of the viewing direction
+    light_frequencies: int = Option(default=4, ge=0)  # frequencies of the embedding of the light
     light: bool = True  # whether the colour depends on the lamp's position, which is the camera's; without: NeRF
-    render_precision: Precision = "auto"  # of products in rendering; auto: bfloat16 where the CPU is made for it
+    # precision of products in rendering; auto: bfloat16 where the CPU is made for it
+    render_precision: Precision = "auto"
     density_noise: float = Option(default=1.0, ge=0)  # standard deviation, in training, before ReLU, per field's unit
 
     @model_validator(mode="after")

@@ -72,7 +72,7 @@ class DepthL1Settings(LossSettings):
     """Options of the L1 depth loss."""
 
     depth: DepthKind = "depth_accumulated"  # rendered depth that is compared; the paper's D is depth_accumulated
-    empty_depth: float = Field(default=100.0, gt=0.0)  # of an empty pixel, mm; inverse_depth_accumulated only
+    empty_depth: float = Field(default=100.0, gt=0.0)  # depth of an empty pixel, mm; inverse_depth_accumulated only
 
 
 class DepthHuberSettings(DepthL1Settings):
@@ -136,9 +136,9 @@ class DistanceL1Settings(LossSettings):
 
     # rendered depth whose distance is compared: the final or the coarse
     depth: Literal["depth_accumulated", "depth_accumulated_coarse"] = "depth_accumulated"
-    unit: Literal["scene", "field"] = "scene"  # of the difference: the scene's, mm in metric data, or the field's own
-    share: float = Field(default=1.0, gt=0.0, le=1.0)  # of the pixels of each frame that count, drawn once
-    seed: int = Field(default=0, ge=0)  # of that draw
+    unit: Literal["scene", "field"] = "scene"  # unit of the difference: the scene's, mm in metric data, or the field's
+    share: float = Field(default=1.0, gt=0.0, le=1.0)  # share of the pixels of each frame that count, drawn once
+    seed: int = Field(default=0, ge=0)  # seed of the pixels drawn
 
 
 class DistanceL1Loss(Loss[DistanceL1Settings]):

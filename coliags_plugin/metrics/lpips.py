@@ -64,7 +64,8 @@ class LPIPSSettings(Settings):
     """Backbone and input range of LPIPS; values of different variants are not comparable."""
 
     net: Literal["vgg", "alex", "squeeze"] = "vgg"  # the backbone
-    # of the network, which was trained on minus-one-one; the splatting papers, this one included, feed [0, 1] unmapped
+    # range of the network's input; it was trained on minus-one-one, but the splatting papers, this one included, feed
+    # [0, 1] unmapped
     input_range: Literal["zero-one", "minus-one-one"] = "zero-one"
 
 

@@ -252,7 +252,7 @@ class ResponseSettings(Settings):
     """Options of the response curve."""
 
     knee: float = Field(default=0.5, ge=0.05, lt=1.0)  # below it, colours stay as they are, which fixes the gauge
-    segments: int = Field(default=8, ge=1, le=64)  # of equal length between the knee and 1.5, each of one slope
+    segments: int = Field(default=8, ge=1, le=64)  # segments of one slope and equal length between the knee and 1.5
 
 
 class CameraResponse(ViewModule[ResponseSettings]):

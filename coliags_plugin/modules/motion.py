@@ -88,7 +88,7 @@ def _median_depth(camera: Camera, scene: Scene) -> float:
 class ImageWarpSettings(Settings):
     """Options of the displacement of images."""
 
-    cells: int = Field(default=8, ge=1)  # of the grid, along either side of the image
+    cells: int = Field(default=8, ge=1)  # cells of the grid along either side of the image
 
 
 class ImageWarp(ViewModule[ImageWarpSettings]):

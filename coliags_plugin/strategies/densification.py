@@ -39,14 +39,17 @@ class AdaptiveDensitySettings(Settings):
     densify_from: int = Field(default=500, ge=0)  # step after which events clone, split and prune
     until: int = Field(default=15_000, ge=0)  # step before which the last event is
     every: int = Field(default=100, ge=1)  # steps between events
-    gradient_threshold: float = Field(default=0.0002, gt=0)  # of the centres' gradient, normalised image units
-    dense_share: float = Field(default=0.01, gt=0)  # of the extent: larger Gaussians are split, smaller ones cloned
-    min_opacity: float = Field(default=0.005, ge=0)  # of a Gaussian that stays
+    # least gradient of a centre that is densified, normalised image units
+    gradient_threshold: float = Field(default=0.0002, gt=0)
+    # share of the extent: larger Gaussians are split, smaller ones cloned
+    dense_share: float = Field(default=0.01, gt=0)
+    min_opacity: float = Field(default=0.005, ge=0)  # least opacity of a Gaussian that stays
     reset_every: int = Field(default=3000, ge=1)  # steps between resets of the opacities, of long enough runs
     reset_opacity: float = Field(default=0.01, gt=0, lt=1)  # the most that a reset leaves
     max_radius: float | None = Field(default=20.0, gt=0)  # pixels; larger ones go after the first reset
-    max_scale_share: float | None = Field(default=0.1, gt=0)  # of the extent; likewise
-    # of a split Gaussian's smallest deviation, in which its parts are spread along that axis
+    # largest scale of a Gaussian that stays, as a share of the extent
+    max_scale_share: float | None = Field(default=0.1, gt=0)
+    # share of a split Gaussian's smallest deviation by which its parts are spread along that axis
     split_normal_share: float = Field(default=1.0, ge=0)
     prune_above: int = Field(default=0, ge=0)  # an event prunes only where more Gaussians than this would stay
 
@@ -174,12 +177,13 @@ class AnchorGrowthSettings(Settings):
     growth_from: int = Field(default=1500, ge=0)  # step after which events grow and prune
     until: int = Field(default=15_000, ge=0)  # step before which the last event is
     every: int = Field(default=100, ge=1)  # steps between events
-    gradient_threshold: float = Field(default=0.0002, gt=0)  # of the centres' gradient, normalised image units
+    # least gradient of a centre that is densified, normalised image units
+    gradient_threshold: float = Field(default=0.0002, gt=0)
     # share of ``every`` steps with an anchor in view for pruning, half of it for growing (docs/methods.md 4.3)
     success_share: float = Field(default=0.8, gt=0, le=1)
     min_opacity: float = Field(default=0.005, ge=0)  # mean of an anchor's that stays
     levels: int = Field(default=3, ge=1)  # cells of the anchors' spacing, and each further level a quarter of that
-    finest_cell: float = Field(default=0.25, ge=0)  # in voxels; finer levels are left out
+    finest_cell: float = Field(default=0.25, ge=0)  # edge of the finest cells, in voxels; finer levels are left out
     pixels_per_birth: int = Field(default=500, ge=1)  # pixels of a view for each birth of an event, strongest first
     max_scale: float | None = Field(default=4.0, gt=0)  # cap on base scales at every event, times the spacing
 

@@ -36,8 +36,9 @@ class MeshSettings(Settings):
 
     # Edge of a voxel in scene units (mm); null: voxel_pixels times the size of a training pixel on the surface.
     voxel_size: float | None = Option(default=None, gt=0)
-    voxel_pixels: float = Option(default=2.0, gt=0)  # see voxel_size
-    truncation: float = Option(default=2.0, ge=1, le=32)  # of the signed distance, in voxels
+    # edge of a voxel in pixels of a training view on the surface, where voxel_size is null
+    voxel_pixels: float = Option(default=2.0, gt=0)
+    truncation: float = Option(default=2.0, ge=1, le=32)  # truncation of the signed distance, in voxels
     depth: Literal["expected", "median"] = "median"  # kind of rendered depth (docs/conventions.md 3)
     # z-depth in scene units beyond which nothing is fused; null: that of the farthest initial point in a training view.
     max_depth: float | None = Option(default=None, gt=0)
