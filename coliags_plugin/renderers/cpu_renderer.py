@@ -17,7 +17,7 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.gaussians import Gaussians
 from coliags_plugin.core.render_output import RenderOutput, Splats
 from coliags_plugin.renderers.projection import slope_limits
-from coliags_plugin.renderers.splatting import CutSettings, SplattingRenderer, check_gaussian_outputs, is_surfels
+from coliags_plugin.renderers.splatting import CutSettings, SplattingRenderer, is_surfels
 
 #: Tensors of the Gaussians in the order of ``layout.Parameters``.
 _TENSORS = ("means", "quats_wxyz", "scales", "opacities", "colors")
@@ -56,7 +56,7 @@ class CpuRenderer(SplattingRenderer[CutSettings]):
         """
         from coliags_plugin.renderers.numba_kernels import pipeline
 
-        check_gaussian_outputs(wants, gaussians)
+        self.check_gaussian_outputs(wants, gaussians)
         self.check_tensors(gaussians)
         pose = camera.camera_to_world.to(device="cpu", dtype=torch.float32)
         images = {image for image, name in _IMAGES.items() if name in ("rgb", "alpha", *wants)}

@@ -103,6 +103,14 @@ class SplattingRenderer(Renderer[SplattingT, GaussianField]):
         if isinstance(self.settings, CutSettings):
             self.settings.distortion_slope(near_plane)
 
+    def check_gaussian_outputs(self, wants: Iterable[str], gaussians: Gaussians) -> None:
+        """Refuse outputs that are neither this renderer's nor features of the Gaussians, and malformed features."""
+        outputs = self.outputs_of("surfels" if is_surfels(gaussians) else "gaussians3d")
+        check_outputs(wants, (*(name for name in OUTPUTS if name in outputs), *gaussians.features))
+        for name, values in gaussians.features.items():
+            if values.ndim != 2 or len(values) != len(gaussians):
+                raise InputError(f"feature {name} of shape {list(values.shape)}", f"[{len(gaussians)}, channels]")
+
     def check_tensors(self, gaussians: Gaussians) -> None:
         """Refuse Gaussians that are malformed, not float32, or on a device that this renderer does not serve."""
         count = len(gaussians.means) if gaussians.means.ndim else 0
@@ -189,21 +197,6 @@ def is_surfels(gaussians: Gaussians) -> bool:
             f"Gaussians with scales of shape {list(scales.shape)}", "three scales each, [N, 3], or two for surfels"
         )
     return scales.shape[1] == 2
-
-
-def check_gaussian_outputs(wants: Iterable[str], gaussians: Gaussians) -> None:
-    """Refuse outputs that are neither a splatting renderer's nor features of the Gaussians, and malformed features."""
-    check_outputs(wants, (*OUTPUTS, *gaussians.features))
-    of_surfels = sorted(SURFEL_OUTPUTS & {*wants} - {*gaussians.features})
-    if of_surfels and not is_surfels(gaussians):
-        raise InputError(
-            f"output {', '.join(of_surfels)} of 3D Gaussians",
-            "surfels, which alone have it",
-            "Choose a field of surfels, or leave it out",
-        )
-    for name, values in gaussians.features.items():
-        if values.ndim != 2 or len(values) != len(gaussians):
-            raise InputError(f"feature {name} of shape {list(values.shape)}", f"[{len(gaussians)}, channels]")
 
 
 # --- choice -----------------------------------------------------------------------------------------------------------

@@ -15,7 +15,6 @@ from coliags_plugin.core.render_output import RenderOutput
 from coliags_plugin.core.tensors import constant
 from coliags_plugin.renderers.splatting import (
     CutSettings,
-    check_gaussian_outputs,
     is_surfels,
     output_of,
     split_channels,
@@ -91,7 +90,6 @@ def draw_view(
     stages: Stages,
 ) -> RenderOutput:
     """Render 3D Gaussians, or surfels where they have two scales; see :class:`SplattingRenderer`."""
-    check_gaussian_outputs(wants, gaussians)
     draw = _draw_surfels if is_surfels(gaussians) else _draw_gaussians
     maps, placed = draw(gaussians, camera, wants, settings, grid, stages)
     if any(settings.background):

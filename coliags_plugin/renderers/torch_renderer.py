@@ -40,6 +40,7 @@ class TorchRenderer(SplattingRenderer[TorchRendererSettings]):
 
     def draw(self, gaussians: Gaussians, camera: Camera, wants: Sequence[str]) -> RenderOutput:
         """Draw Gaussians, in their dtype and on their device."""
+        self.check_gaussian_outputs(wants, gaussians)
         grid = TileGrid(camera.width, camera.height, self.settings.tile_size)
         return draw_view(gaussians, camera, wants, self.settings, grid, _STAGES)
 

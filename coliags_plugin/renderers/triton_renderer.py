@@ -34,6 +34,7 @@ class TritonRenderer(SplattingRenderer[CutSettings]):
 
     def draw(self, gaussians: Gaussians, camera: Camera, wants: Sequence[str]) -> RenderOutput:
         """Draw Gaussians, on their device."""
+        self.check_gaussian_outputs(wants, gaussians)
         self.check_tensors(gaussians)
         from coliags_plugin.renderers.triton_kernels import compositing, placing, sweeps
 

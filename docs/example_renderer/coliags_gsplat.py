@@ -22,7 +22,6 @@ from coliags_plugin.renderers.projection import facing
 from coliags_plugin.renderers.splatting import (
     SplattingRenderer,
     SplattingSettings,
-    check_gaussian_outputs,
     output_of,
     split_channels,
 )
@@ -52,7 +51,7 @@ class GsplatRenderer(SplattingRenderer[SplattingSettings]):
     def draw(self, gaussians: Gaussians, camera: Camera, wants: Sequence[str]) -> RenderOutput:
         """Render the Gaussians; everything but ``radii`` is differentiable, in them and in the pose."""
         self.check_tensors(gaussians)
-        check_gaussian_outputs(wants, gaussians)
+        self.check_gaussian_outputs(wants, gaussians)
         camera = camera.to(gaussians.means.device, gaussians.means.dtype)
         return output_of(gaussians, camera, wants, *self._drawn(gaussians, camera, wants))
 

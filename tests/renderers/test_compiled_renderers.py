@@ -145,7 +145,7 @@ def near_horizon(gaussians, camera):
 
 def drawn(renderer, gaussians, camera, dtype, wants=None, ignored=None, of_means2d=0.0):
     """Output and gradients of one renderer under random cotangents, which are 0 at the pixels ignored."""
-    wants = wants or outputs_of(gaussians)
+    wants = wants or outputs_of(gaussians, renderer)
     gaussians = cast(gaussians, dtype, grad=True)
     features = {name: value.to(dtype).clone().requires_grad_() for name, value in gaussians.features.items()}
     pose = camera.camera_to_world.to(dtype).clone().requires_grad_()
@@ -185,8 +185,9 @@ def test_agrees_with_the_definition_in_float64(renderer, primitive, name):
     gaussians, camera = scene(primitive, name)
     ignored = on_a_cutoff(gaussians, camera)
     assert int(ignored.sum()) <= few(ignored.numel())
-    ours, gradients = drawn(renderer, gaussians, camera, torch.float32, ignored=ignored)
-    true, true_gradients = drawn(TorchRenderer, gaussians, camera, torch.float64, ignored=ignored)
+    wants = outputs_of(gaussians, renderer)
+    ours, gradients = drawn(renderer, gaussians, camera, torch.float32, wants, ignored)
+    true, true_gradients = drawn(TorchRenderer, gaussians, camera, torch.float64, wants, ignored)
     of_outputs, of_gradients = MAGNIFIED.get((primitive, name), (1e-5, 2e-5))
     if renderer is not CpuRenderer and primitive == "surfels":
         of_gradients *= 3  # sums of offsets in the image, which cancel more than those of offsets on the disc
@@ -194,7 +195,7 @@ def test_agrees_with_the_definition_in_float64(renderer, primitive, name):
     most = (10 if primitive == "surfels" else 1) * of_outputs
     off = (ours["depth_median"] - true["depth_median"]).abs() > most * true["depth_median"]
     assert int((off & ~ignored).sum()) <= few(ignored.numel())
-    for key in outputs_of(gaussians):
+    for key in wants:
         if not (key == "depth_median" and off[~ignored].any()):
             assert relative(ours[key][~ignored], true[key][~ignored]) <= of_outputs, key
     for key, gradient in gradients.items():
@@ -232,7 +233,7 @@ def test_any_outputs_and_features_and_the_centres_own_gradient_agree_with_the_de
     renderer, primitive, name, wants
 ):
     gaussians, camera = scene(primitive, name)
-    gaussians, wants = with_features(gaussians), wants or (*outputs_of(gaussians), "one")
+    gaussians, wants = with_features(gaussians), wants or (*outputs_of(gaussians, renderer), "one")
     ignored = on_a_cutoff(gaussians, camera)
     ours, gradients = drawn(renderer, gaussians, camera, torch.float32, wants, ignored, of_means2d=0.01)
     true, true_gradients = drawn(TorchRenderer, gaussians, camera, torch.float64, wants, ignored, of_means2d=0.01)
@@ -259,7 +260,10 @@ def test_features_are_composited_like_colours_over_black(primitive):
 def test_features_that_are_none(renderer):
     gaussians, camera = scene("gaussians3d")
     nothing = cast(random_gaussians(0), torch.float32)
-    nothing, wants = dataclasses.replace(nothing, features={"one": torch.zeros(0, 1)}), (*solids.OUTPUTS, "one")
+    nothing, wants = (
+        dataclasses.replace(nothing, features={"one": torch.zeros(0, 1)}),
+        (*outputs_of(nothing, renderer), "one"),
+    )
     assert not render_gaussians(nothing, camera, wants, renderer=renderer)["one"].any()
     with pytest.raises(InputError, match=r"no renderer output 'onne'.*\n?.*'one'"):
         render_gaussians(nothing, camera, ("onne",), renderer=renderer)
@@ -275,7 +279,7 @@ def test_features_that_are_none(renderer):
 @of_each
 def test_repeats_to_the_bit_with_any_number_of_threads(primitive):
     gaussians, camera = scene(primitive, "thousands")
-    wants = outputs_of(gaussians)
+    wants = outputs_of(gaussians, CpuRenderer)
     if primitive == "surfels":
         gaussians, wants = with_features(gaussians), (*wants, "one")
     first = None
@@ -348,7 +352,7 @@ def test_any_size(renderer, primitive, n, width, height, seed):
 def test_what_is_not_drawn_gets_no_gradient(renderer, made, mean, scales, opacity, quat):
     gaussians = made(mean, scales, opacity, quats=torch.tensor([quat]).expand(len(mean) // 3, 4))
     gaussians = cast(gaussians, torch.float32, grad=True)
-    wants, pose = outputs_of(gaussians), torch.eye(4).requires_grad_()
+    wants, pose = outputs_of(gaussians, renderer), torch.eye(4).requires_grad_()
     near_plane = 0.0 if mean[2:] == [-3.0] else 0.25
     camera = dataclasses.replace(pinhole(dtype=torch.float32), camera_to_world=pose, near_plane=near_plane)
     output = render_gaussians(gaussians, camera, wants, TorchRendererSettings(background=BACKGROUND), renderer)
@@ -390,7 +394,7 @@ def test_shapes_dtypes_devices_and_outputs_are_checked(primitive):
                 render_gaussians(dataclasses.replace(gaussians, **{name: broken}), camera, renderer=CpuRenderer)
     with pytest.raises(InputError, match="scales"):
         render_gaussians(dataclasses.replace(gaussians, scales=gaussians.scales[:, :1]), camera, renderer=CpuRenderer)
-    output, message = ("depth", "no renderer output") if primitive == "surfels" else ("distortion", "of 3D Gaussians")
+    output, message = ("depth" if primitive == "surfels" else "distortion"), "no renderer output"
     with pytest.raises(InputError, match=message):
         render_gaussians(gaussians, camera, (output,), renderer=CpuRenderer)
 
@@ -424,7 +428,7 @@ def test_extreme_sizes_and_views_stay_finite(renderer, seed, exponent):
     gaussians.quats_wxyz[:10] = torch.stack([half, half * 0, half, half * 0])
     gaussians.means[:5, 0] = 0.0
     output, gradients = drawn(renderer, gaussians, pinhole(9, 7, dtype=torch.float32), torch.float32)
-    assert all(torch.isfinite(output[name]).all() for name in OUTPUTS)
+    assert all(torch.isfinite(output[name]).all() for name in outputs_of(gaussians, renderer))
     assert all(torch.isfinite(gradients[name]).all() for name in ("opacities", "colors"))
 
 

@@ -116,8 +116,9 @@ SCENES = {
 }
 
 
-def outputs_of(gaussians):
-    return OUTPUTS if gaussians.scales.shape[1] == 2 else SOLID_OUTPUTS
+def outputs_of(gaussians, renderer=TorchRenderer):
+    outputs = renderer.outputs_of("surfels" if gaussians.scales.shape[1] == 2 else "gaussians3d")
+    return tuple(name for name in OUTPUTS if name in outputs)
 
 
 def ours(**options):
