@@ -69,16 +69,22 @@ class Pool:
         return array.reshape(shape)
 
     def _buffer(self, size: int) -> npt.NDArray[np.uint8]:
+        """The memory of this size that came back last, as the processor's caches may still hold it; or else new."""
+        others, buffer = [], None
         for _ in range(len(self._free)):
             try:
-                buffer = self._free.popleft()
+                candidate = self._free.pop()
             except IndexError:
                 break
-            if size <= len(buffer) <= 2 * size + _PAGE:
-                return buffer
-            self._free.append(buffer)
-        buffer = np.empty(int(size * _GROWTH) + 2 * _ALIGNMENT, np.uint8)
-        return buffer[-buffer.ctypes.data % _ALIGNMENT :]
+            if size <= len(candidate) <= 2 * size + _PAGE:
+                buffer = candidate
+                break
+            others.append(candidate)
+        self._free.extend(reversed(others))
+        if buffer is None:
+            buffer = np.empty(int(size * _GROWTH) + 2 * _ALIGNMENT, np.uint8)
+            buffer = buffer[-buffer.ctypes.data % _ALIGNMENT :]
+        return buffer
 
 
 _pool = Pool()
