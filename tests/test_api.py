@@ -203,7 +203,6 @@ def test_examples_of_the_pages_run(tmp_path, monkeypatch):
         for block in re.findall(r"^```python\n(.*?)^```$", text, re.DOTALL | re.MULTILINE):
             exec(block, names)
         assert isinstance(names["run"], cp.Run)
-        shutil.rmtree("comparison")
 
 
 def test_a_handle_needs_no_torch(trained, result):
