@@ -59,7 +59,7 @@ class PlannedCell(BaseModel, frozen=True):
 
     @property
     def failure_file(self) -> str:
-        """File with the reason why it failed."""
+        """File with the reason for the failure of a cell."""
         return f"{FAILURES}/{self.result.removeprefix(f'{RESULTS}/')}"
 
     @property

@@ -236,7 +236,7 @@ def assignments(settings: Mapping[str, object] | None) -> tuple[str, ...]:
 
 
 def _plain(value: object, key: str) -> object:
-    """The value as YAML has it."""
+    """Value of a node as plain lists, mappings and scalars."""
     if hasattr(value, "item") and getattr(value, "ndim", None) == 0:
         value = value.item()  # a number of NumPy
     if isinstance(value, Path):

@@ -256,7 +256,7 @@ UNIT_FILE = "unit.txt"
 
 
 def read_unit(folder: Path, otherwise: Unit = "unknown") -> Unit:
-    """The unit of the poses and depth of the scene in a folder; ``otherwise``: that of a folder that states none."""
+    """Unit of the poses and depth of the scene in a folder; ``otherwise`` where the folder states none."""
     path = folder / UNIT_FILE
     if not path.is_file():
         return otherwise

@@ -49,7 +49,7 @@ class PlainGeometryHead(GeometryHead[GeometryT]):
 
     @property
     def frequencies(self) -> int:
-        """Number of frequencies of the embedding of the viewing direction; 0 leaves it as it is."""
+        """Number of frequencies of the embedding of the viewing direction; 0: the direction itself."""
         return 0
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:

@@ -37,7 +37,7 @@ class MSELoss(Loss[MSESettings]):
 
     @property
     def wants(self) -> frozenset[str]:
-        """The coarse image, if that is compared."""
+        """``rgb_coarse`` where the coarse image is compared."""
         return frozenset({self.settings.image} - {"rgb"})
 
     def __call__(self, step: TrainingStep) -> Float[Tensor, ""]:

@@ -317,7 +317,7 @@ def submap_table(contents: Contents) -> Table:
 
 
 def _area_of(submap: SubmapContents, name: str) -> str | None:
-    """One of its areas; None where that is unknown."""
+    """An area among the figures of a sub-map, as text; None where it is unknown."""
     figures = submap.figures
     return area_text(figures[name], figures.get("unit") == "mm") if name in figures else None
 

@@ -249,7 +249,7 @@ class StageJobs:
         return jobs
 
     def _begin_submaps(self, shared: StageJob) -> list[StageJob]:
-        """Jobs of the sub-maps of a segment that has poses, but those that are done."""
+        """Jobs still to do of the sub-maps of a segment with poses."""
         contexts, size = shared.context.submaps(), shared.size / _SHARED_WORK - shared.size
         frames = [context.submap.frames or 1 for context in contexts if context.submap]
         jobs = list[StageJob]()
@@ -259,7 +259,7 @@ class StageJobs:
         return [job for job in jobs if not job.is_done]
 
     def end(self, job: StageJob, error: ReportedError | None = None) -> list[StageJob]:
-        """Take that a job has ended, or why it failed; returns what is to be done after it.
+        """Record the end of a job, or the reason for its failure; returns the jobs that come next.
 
         After the poses of a segment, that are its sub-maps, and the segments that have waited for its camera.
         """
@@ -311,7 +311,7 @@ class StageJob(Job):
         return all(self._jobs.record.is_done(stage.name) for stage in self.stages)
 
     def run_here(self) -> list[StageJob]:
-        """Do it in this process; returns what is to be done after it.
+        """Run a job in this process; returns the jobs that come next.
 
         Raises:
             NotWritableError: The disk is full, or cannot be written.

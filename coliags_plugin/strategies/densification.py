@@ -23,6 +23,11 @@ _SPLIT_SHRINK = 0.8 * _SPLIT_PARTS
 _RECOVERY = 200
 
 
+def _idle_text(what: str, schedule: Schedule, every: int, first: int, until: int) -> str:
+    """Plan of a run without an event between steps ``first`` and ``until``; ``what`` says what it does not do."""
+    return f"this run {what}: its {schedule.steps} steps leave no multiple of {every} between steps {first} and {until}"
+
+
 class NoStrategy(Strategy):
     """Strategy that neither grows nor prunes."""
 
@@ -80,10 +85,8 @@ class AdaptiveDensity(Strategy[AdaptiveDensitySettings]):
         """Steps at which this run densifies and resets opacities, for the log."""
         every, events, resets = self.every, self.events, self.resets
         if len(events) == 0:
-            return (
-                f"this run neither densifies nor prunes: its {self.schedule.steps} steps leave no multiple of {every} "
-                f"between steps {self.schedule.at(self.settings.densify_from)} and {self.until}"
-            )
+            first = self.schedule.at(self.settings.densify_from)
+            return _idle_text("neither densifies nor prunes", self.schedule, every, first, self.until)
         return f"this run clones, splits and prunes {steps_text(events)}, and resets opacities {steps_text(resets)}"
 
     @torch.no_grad()
@@ -217,10 +220,8 @@ class AnchorGrowth(Strategy[AnchorGrowthSettings]):
         """Steps at which this run grows and prunes, for the log."""
         every, events = self.every, self.events
         if len(events) == 0:
-            return (
-                f"this run neither grows nor prunes anchors: its {self.schedule.steps} steps leave no multiple of "
-                f"{every} between steps {self.schedule.at(self.settings.growth_from)} and {self.until}"
-            )
+            first = self.schedule.at(self.settings.growth_from)
+            return _idle_text("neither grows nor prunes anchors", self.schedule, every, first, self.until)
         return f"this run grows and prunes anchors {steps_text(events)}"
 
     @torch.no_grad()

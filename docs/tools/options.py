@@ -225,7 +225,7 @@ def _with_range(text: str, metadata: Any) -> str:
 
 
 def _kind_of(validator: PlainValidator) -> str | None:
-    """The kind of component that a node of coliags_plugin.core.components stands for."""
+    """Kind of component that a validator of ``core.components`` makes; None for other validators."""
     args = getattr(validator.func, "args", ())
     return args[0] if args and args[0] in REGISTRIES else None
 

@@ -176,7 +176,7 @@ _COLORS, _RAW_COLORS = "COLOR_0", "_OLOR_0"
 
 
 def read_mesh(path: Path) -> TriangleMesh:
-    """Read a mesh from a PLY, OBJ or GLB file, told apart by their suffix; lengths stay, polygons become triangles."""
+    """Read a mesh from a PLY, OBJ or GLB file, by its suffix; lengths are unchanged, polygons become triangles."""
     return read_flagged_mesh(path)[0]
 
 
@@ -200,7 +200,7 @@ def read_flagged_mesh(path: Path) -> tuple[TriangleMesh, Int[np.ndarray, "F"] | 
 
 
 def write_mesh(path: Path, mesh: TriangleMesh, texture: Texture | None = None) -> None:
-    """Write a mesh as PLY, OBJ or GLB, told apart by the suffix, atomically; the folder is made.
+    """Write a mesh atomically as PLY, OBJ or GLB, by the suffix; creates the folder.
 
     Vertex colours are written as they are: in PLY as uchar, in OBJ as three numbers in [0, 1] behind the position (an
     extension that MeshLab, Blender and open3d read), in GLB as linear light, as glTF demands. GLB has the same axes and

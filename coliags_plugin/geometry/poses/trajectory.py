@@ -31,7 +31,7 @@ def check_rigid(
     expected: str = f"both within {RIGID_TOLERANCE:g}",
     do: str = "",
 ) -> None:
-    """Refuse the first matrix that is not finite, rigid and right-handed, or lies absurdly far away.
+    """Refuse poses that are not finite, rigid and right-handed, or lie beyond ``bounds.LENGTH``; the first is named.
 
     ``place`` names the matrix of an index in the message: file and line, or frame; ``expected`` and ``do`` are for one
     that is not rigid.

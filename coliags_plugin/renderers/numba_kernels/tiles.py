@@ -158,7 +158,7 @@ def _nearest_of_surfel(in_ellipse, reach, records, row, left, right, top, bottom
 
 @part
 def _nearest_of_crossing(reach, records, row, left, right, top, bottom, view):
-    """Stands for the distance where a disc crosses the near plane: ``reach`` in boxes where it may be seen."""
+    """Stand-in for the distance of a disc that crosses the near plane: ``reach`` in boxes where it may be seen."""
     scale, (shift_x, shift_y) = vec.broadcast(view, layout.VIEW_PIXEL_SCALE), _circle(records, row)
     half_x, half_y = vec.mul(0.5, vec.sub(right, left)), vec.mul(0.5, vec.sub(bottom, top))
     x, y = vec.sub(vec.add(left, half_x), shift_x), vec.sub(vec.add(top, half_y), shift_y)

@@ -286,7 +286,7 @@ def _region_table(coverage: WallCoverage) -> Table:
 def region_picture(
     coverage: WallCoverage, region: MissedRegion, view: CoverageView
 ) -> UInt8[np.ndarray, "H W 3"] | None:
-    """The recorded frame nearest to a region, with the region drawn over it where it lies, hidden or not; RGB."""
+    """Recorded frame nearest to a missed region, RGB, with the region, occluded or not, drawn on it. [H, W, 3]"""
     if view.read_image is None:
         return None
     image = view.read_image()

@@ -216,7 +216,7 @@ def bending(mesh: TriangleMesh, bent: Bool[np.ndarray, "V"]) -> csr_array:
 
 
 def close_holes(mesh: TriangleMesh, perimeter: float, views: Sequence[DepthView]) -> tuple[TriangleMesh, int]:
-    """The mesh, without colours, with its holes up to a perimeter, scene units, closed; and how many those were.
+    """Close the holes up to a perimeter, scene units; returns the mesh, without colours, and their number.
 
     A hole is closed by rings of triangles about its centre, as wide as its edges are long, that go on smoothly from the
     triangles around it. It stays open unless, counted over the new vertices, more views see wall there, from its front,
