@@ -11,15 +11,20 @@ import numpy as np
 import pytest
 import torch
 
+from coliags_plugin.api.runs import warn_of_suspect_data
 from coliags_plugin.checks.data.check import check_scene, video_pairs
 from coliags_plugin.checks.data.findings import findings_of, image_facts, lamp_facts, path_facts
 from coliags_plugin.checks.data.hypotheses import CHANGES, FrameMatches, Pair, agreement, best_scale, supported
 from coliags_plugin.checks.data.page import check_page
 from coliags_plugin.core.cameras import Camera
+from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.core.scenes import Frame, PointCloud, Scene, SparseDepth
 from coliags_plugin.datamanagers.c3vd import C3VDDataManager, C3VDSettings
+from coliags_plugin.engine.data_formats import open_scene
+from coliags_plugin.geometry.lenses.models import PinholeLens
 from coliags_plugin.reporting.text_formats import page_text
 from tests.commands import run
+from tests.datamanagers.wall_scenes import HEIGHT, WIDTH, write_wall
 from tests.scenes import write_frames
 from tests.textured_tube import tube_frames
 
@@ -378,6 +383,19 @@ def test_images_that_show_nothing_again_leave_poses_undecided(unmatched):
     check = check_scene(noise)
     assert [doubt.what for doubt in check.undecided] == ["the images cannot tell whether the poses are right"]
     assert check.findings == [] and check.matches == {}
+
+
+@pytest.mark.parametrize(("layout", "is_suspect"), [("c3vd", False), ("c3vd-raw", False), ("endogslam", True)])
+def test_training_on_endogslams_data_warns_of_their_calibration(tmp_path, caplog, layout, is_suspect):
+    folder = write_wall(tmp_path / layout, layout, 3)
+    warn_of_suspect_data(open_scene(folder))
+    assert ("EndoGSLAM's calibration does not fit" in caplog.text) == is_suspect
+
+
+def test_another_calibration_of_endogslams_data_is_not_suspected(tmp_path):
+    lens = PinholeLens.of(Intrinsics(385.0, 385.0, 338.0, 270.0, 675, 540).resized(WIDTH, HEIGHT))
+    scene = open_scene(write_wall(tmp_path / "wall", "endogslam", 3, lens=lens))
+    assert "EndoGSLAM's calibration" not in whats(scene)
 
 
 @pytest.mark.thorough

@@ -116,7 +116,7 @@ def check_scene(
         ("depth", depth and depth | {"metric": scene.is_metric}),
         ("lamp", lamp),
         ("path", path),
-        *(("camera", camera) for camera in rules.camera_facts(video)),
+        *(("camera", camera | {"dataset": scene.provenance.dataset}) for camera in rules.camera_facts(video)),
         ("images", images | {"repeats": len(images["repeated"])}),
     ]
     findings = [finding for about, values in measured for finding in rules.findings_of(about, values)]
