@@ -165,7 +165,10 @@ def prepare(settings: PhantomSettings, report: Progress) -> PreparedPhantom:
         albedo = vertex_albedo(surface, mucosa)
         indirect[:] = indirect_lights(surface, albedo, lamps, poses, settings.interreflection, generator)
     report("colon", 3, 4)
-    lens, mask = layout.lens(settings.width or 0, settings.height or 0)
+    size = settings.width or 0, settings.height or 0
+    lens, mask = layout.lens(*size)
+    if real := settings.real_endoscope:
+        lens = layout.lens_of(real.lens, *size)
     phantom = PreparedPhantom(
         settings,
         layout,

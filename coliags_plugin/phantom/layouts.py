@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple
 
@@ -19,7 +19,7 @@ from coliags_plugin.core.files import atomic_write, write_json
 from coliags_plugin.core.images import write_image
 from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.core.scene_files import write_camera_json, write_unit
-from coliags_plugin.geometry.lenses.models import Lens, OpenCVLens, PinholeLens
+from coliags_plugin.geometry.lenses.models import FisheyeLens, Lens, OpenCVLens, PinholeLens
 from coliags_plugin.geometry.poses import tum
 from coliags_plugin.geometry.poses.c3vd import matrix_lines
 from coliags_plugin.geometry.poses.colmap import colmap_poses, posed_model, write_reconstruction
@@ -78,11 +78,14 @@ class Layout(ABC):
         Default: C3VD's undistorted camera, scaled by width, its principal point at the same distance from the middle;
         all pixels are lit.
         """
-        k = _C3VD_PINHOLE
-        scale = width / k.width
-        cx = 0.5 * width + (k.cx - 0.5 * k.width) * scale
-        cy = 0.5 * height + (k.cy - 0.5 * k.height) * scale
-        return PinholeLens(k.fx * scale, k.fy * scale, cx, cy, width, height), np.ones((height, width), bool)
+        return _scaled(_C3VD_PINHOLE, width, height), np.ones((height, width), bool)
+
+    def lens_of(self, endoscope: FisheyeLens, width: int, height: int) -> Lens:
+        """The lens of frames of this size that a real endoscope films, given its lens.
+
+        Default: the nominal pinhole of that lens, without its distortion, scaled as in :meth:`lens`.
+        """
+        return _scaled(endoscope.pinhole, width, height)
 
     def is_test(self, index: int) -> bool:
         """Return whether a frame of the video is held out by the layout's split; default: 0, 8, 16, ..."""
@@ -103,6 +106,14 @@ class Layout(ABC):
     def seen_mask(self, folder: Path, part: Part, index: int) -> Path:
         """Path of the seen mask of a test frame."""
         return folder / ("truth" if part == "video" else part) / "seen" / f"{index:04d}_seen.png"
+
+
+def _scaled(k: Intrinsics, width: int, height: int) -> PinholeLens:
+    """A pinhole scaled by width, its principal point at the same distance from the middle."""
+    scale = width / k.width
+    cx = 0.5 * width + (k.cx - 0.5 * k.width) * scale
+    cy = 0.5 * height + (k.cy - 0.5 * k.height) * scale
+    return PinholeLens(k.fx * scale, k.fy * scale, cx, cy, width, height)
 
 
 def part_folder(folder: Path, part: Part) -> Path:
@@ -215,12 +226,16 @@ class ColmapLayout(Layout):
 
 
 class NerfstudioLayout(Layout):
-    """images/, depth/, unit.txt and a transforms.json with an OPENCV camera that distorts."""
+    """images/, depth/, unit.txt and a transforms.json with a camera that distorts, OPENCV or OPENCV_FISHEYE."""
 
     def lens(self, width: int, height: int) -> tuple[Lens, Bool[np.ndarray, "H W"]]:
         """The default camera with OpenCV's lens distortion."""
         plain, lit = super().lens(width, height)
         return OpenCVLens(**vars(plain.pinhole), **_DISTORTION), lit
+
+    def lens_of(self, endoscope: FisheyeLens, width: int, height: int) -> Lens:
+        """The lens with its distortion; pixels from 90 degrees on stay black."""
+        return replace(endoscope, **vars(super().lens_of(endoscope, width, height).pinhole))
 
     def write_frame(self, folder: Path, frame: PhantomFrame) -> None:
         """Write the image, and depth in steps of 0.01 mm."""
@@ -240,9 +255,11 @@ class NerfstudioLayout(Layout):
             }
             for name, pose in zip(names, poses, strict=True)
         ]
-        k = lens.pinhole
-        camera = {"fl_x": k.fx, "fl_y": k.fy, "cx": k.cx, "cy": k.cy, "w": lens.width, "h": lens.height, **_DISTORTION}
-        content = {"camera_model": "OPENCV", **camera, "depth_unit_scale_factor": _DEPTH_UNIT, "frames": frames}
+        k, model, terms = lens.pinhole, "OPENCV", _DISTORTION
+        if isinstance(lens, FisheyeLens):
+            model, terms = "OPENCV_FISHEYE", {"k1": lens.k1, "k2": lens.k2, "k3": lens.k3, "k4": lens.k4}
+        camera = {"fl_x": k.fx, "fl_y": k.fy, "cx": k.cx, "cy": k.cy, "w": lens.width, "h": lens.height, **terms}
+        content = {"camera_model": model, **camera, "depth_unit_scale_factor": _DEPTH_UNIT, "frames": frames}
         write_json(folder / "transforms.json", content)
         write_unit(folder, "mm")
 

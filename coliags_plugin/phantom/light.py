@@ -23,7 +23,7 @@ from coliags_plugin.phantom.streams import smoothstep
 
 #: Distance at which radiance is 1, mm.
 UNIT_DISTANCE = 20.0
-#: cos psi below which the beam fades to 0 at 90 degrees: light guides only emit forward. No pixel looks there.
+#: cos psi below which the beam fades to 0 at 90 degrees: light guides only emit forward. No pinhole looks there.
 _EDGE = float(np.cos(np.radians(72.0)))
 #: Normal reflectance of the mucus film: an index of refraction of 1.40.
 F0 = 0.028
@@ -45,15 +45,15 @@ class CameraLight:
 
     @classmethod
     def all_of(cls, settings: PhantomSettings) -> tuple[CameraLight, ...]:
-        """Lamps from settings; they are tilted downwards in the image, and their shares sum to 1."""
-        preset = settings.light_preset
+        """Lamps from settings; their axis is the real endoscope's, or tilted downwards; their shares sum to 1."""
+        preset, real = settings.light_preset, settings.real_endoscope
         tilt = np.radians(preset.tilt)
         offsets = settings.lamps or (settings.light_offset or (0.0, 0.0, 0.0),)
         shares = settings.lamp_shares or (1.0,) * len(offsets)
         return tuple(
             cls(
                 offset=offset,
-                axis=(0.0, float(np.sin(tilt)), float(np.cos(tilt))),
+                axis=real.axis if real else (0.0, float(np.sin(tilt)), float(np.cos(tilt))),
                 spread_law=preset.spread_law,
                 spread=preset.spread,
                 specular=settings.specular,

@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Annotated, Any, Literal
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, field_validator, model_validator
 from typing_extensions import Self
 
 from coliags_plugin.config.yaml_tree import tuples
+from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.registry import phantom_layouts
 from coliags_plugin.core.settings import Settings, validated
+
+if TYPE_CHECKING:
+    from coliags_plugin.geometry.lenses.endoscopes import Endoscope
 
 #: A colour matrix that changes nothing.
 SAME_COLORS = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
@@ -129,6 +133,9 @@ class PhantomSettings(Settings):
     supersampling: int = Field(2, ge=1, le=4)  # colour samples per pixel side; depth is never averaged
 
     light: Literal["c3vd", "strong"] = "c3vd"  # preset of light and motion; see PRESETS
+    # A real endoscope, endomapper-01 to endomapper-18: its lens in place of the layout's, and its beam in place of that
+    # of ``light`` and the vignetting (docs/phantom.md 3.3).
+    endoscope: str | None = None
     # auto: exposure follows the image with a lag. fixed: one exposure for the whole sequence.
     gain: GainMode | None = None
     # Lamp in camera axes (x right, y down, z forward), mm, at most 5 mm from the lens. A fitted real endoscope: (-0.06,
@@ -215,6 +222,15 @@ class PhantomSettings(Settings):
             raise ValueError(f"unknown layout; known are {', '.join(phantom_layouts)}")
         return name
 
+    @field_validator("endoscope")
+    @classmethod
+    def _endoscope_is_known(cls, name: str | None) -> str | None:
+        try:
+            _endoscope(name)
+        except InputError as error:
+            raise ValueError(str(error)) from error
+        return name
+
     @field_validator("lamp_shares")
     @classmethod
     def _shares_are_light(cls, shares: tuple[float, ...]) -> tuple[float, ...]:
@@ -249,9 +265,22 @@ class PhantomSettings(Settings):
         return bool(self.fluid or self.bubbles or self.tool or self.washes)
 
     @property
+    def real_endoscope(self) -> Endoscope | None:
+        """The endoscope whose lens and beam the phantom has; None: those of layout and preset."""
+        return _endoscope(self.endoscope)
+
+    @property
     def light_preset(self) -> Preset:
-        """The preset of light and motion."""
-        return PRESETS[self.light]
+        """The preset of light and motion, with the beam of the real endoscope if there is one."""
+        preset, real = PRESETS[self.light], self.real_endoscope
+        # The power was fitted to images, so that it holds the lens's vignetting.
+        return replace(preset, spread_law="cosine", spread=real.power, vignetting=0.0) if real else preset
+
+
+def _endoscope(name: str | None) -> Endoscope | None:
+    from coliags_plugin.geometry.lenses.endoscopes import endoscope  # with numpy, which --help does without
+
+    return None if name is None else endoscope(name)
 
 
 def phantom_settings(options: Mapping[str, Any]) -> PhantomSettings:

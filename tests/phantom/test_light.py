@@ -111,6 +111,15 @@ def test_exponential_beam_is_modrzejewskis():
     assert lamp().beam(np.array([-0.5]))[0] == 0.0
 
 
+def test_the_beam_of_a_real_endoscope_falls_off_about_its_tilted_axis():
+    guides = CameraLight.all_of(PhantomSettings(endoscope="endomapper-09", lamps=GUIDES, light="strong"))
+    assert tuple(guide.offset for guide in guides) == GUIDES
+    axis = np.array([0.079933, 0.116518, 0.989967])  # 8.1 degrees from the optical axis
+    for guide, away in zip(guides, 20.0 * directions(np.radians([0.0, 25.0, 50.0]), np.array(0.4)), strict=True):
+        strength, _ = guide.irradiance((guide.offset + away)[None], np.eye(4))
+        assert strength[0] == pytest.approx((away @ axis / 20.0) ** 2.818881 / 3.0, rel=1e-5)
+
+
 def test_gloss_at_normal_incidence_is_the_closed_form():
     # D = 1 / (pi alpha^2), no masking, Fresnel F0: pi D F / 4 = F0 / (4 alpha^2), with alpha = roughness^2.
     up = np.array([[0.0, 0.0, 1.0]])

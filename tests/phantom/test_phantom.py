@@ -20,6 +20,7 @@ from coliags_plugin.comparison.named_files import load_benchmark
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.registry import datamanagers, phantom_layouts
 from coliags_plugin.engine.data_formats import find_format
+from coliags_plugin.geometry.lenses.endoscopes import endoscope
 from coliags_plugin.geometry.lenses.models import PinholeLens
 from coliags_plugin.geometry.meshes.mesh import TriangleMesh, read_mesh
 from coliags_plugin.phantom import light as lighting
@@ -223,6 +224,41 @@ def test_the_phantoms_split_is_the_one_that_its_manager_reads(name, tmp_path):
     assert np.load(tmp_path / "colon/truth/camera_to_world.npy").shape == (FRAMES, 4, 4)
 
 
+# Phantoms of a real endoscope
+
+
+@pytest.mark.parametrize("layout", BUILT_IN)
+def test_a_real_endoscopes_lens_is_scaled_by_width_about_the_middle(layout):
+    lens = endoscope("endomapper-03").lens
+    whole, cropped = (layout_of(layout).lens_of(lens, 160, height) for height in (120, 128))
+    assert vars(whole.pinhole) == pytest.approx(vars(lens.resized(160, 120).pinhole))
+    k = cropped.pinhole
+    assert (k.fx, k.fy) == pytest.approx((726.7941 / 9.0, 727.7907 / 9.0))
+    assert (k.cx - 80.0, k.cy - 64.0) == pytest.approx(((742.7416 + 0.5 - 720.0) / 9.0, (542.1428 + 0.5 - 540.0) / 9.0))
+    # A point at 45 degrees to the right, by the definition of the lens.
+    right = k.fx
+    if layout == "nerfstudio":
+        r = np.pi / 4.0
+        bend = 1.0 - 0.1289632 * r**2 - 0.006051189 * r**4 + 0.001660961 * r**6 - 7.847858e-05 * r**8
+        right = k.fx * r * bend
+    np.testing.assert_allclose(cropped.project([[5.0, 0.0, 5.0]]), [[k.cx + right, k.cy]], rtol=1e-12)
+
+
+@pytest.mark.parametrize("layout", ["c3vd", "nerfstudio"])
+def test_a_phantom_of_a_real_endoscope_loads_with_its_lens_and_light(layout, tmp_path):
+    write_phantom(tmp_path / "colon", layout, 48, 36, endoscope="endomapper-09")
+    real = endoscope("endomapper-09")
+    truth = json.loads((tmp_path / "colon/truth/light.json").read_text())
+    assert (truth["vignetting"], truth["lamp"]["spread_law"]) == (0.0, "cosine")
+    assert (truth["lamp"]["spread"], truth["lamp"]["axis"]) == (real.power, list(real.axis))
+    for frame in load_scene(tmp_path / "colon").train:
+        k = frame.camera.intrinsics
+        assert vars(k) == pytest.approx(vars(real.lens.resized(48, 36).pinhole), rel=1e-6)
+        assert frame.valid.all()
+        for rim in ([0, -1], (slice(None), [0, -1])):
+            assert (frame.depth[rim] > 0.0).all() and frame.image[rim].float().mean() > 40.0
+
+
 # Settings of phantoms, and those of the benchmarks
 
 
@@ -244,6 +280,7 @@ def test_the_phantoms_split_is_the_one_that_its_manager_reads(name, tmp_path):
         ({"seed": -1}, "seed"),
         ({"layout": "c3vd_raw"}, "phantom setting layout: .*unknown layout; known are c3vd, .*colmap"),
         ({"polypes": 3}, "polyps"),
+        ({"endoscope": "endomaper-07"}, "phantom setting endoscope: no endoscope.*Did you mean 'endomapper-07'"),
     ],
 )
 def test_bad_settings_are_named(options, named):
