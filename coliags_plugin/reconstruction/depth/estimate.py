@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import math
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -43,12 +44,14 @@ from coliags_plugin.reconstruction.depth.sweeping import (
     Swept,
     WeightedDepth,
     depth_confidence,
+    disagreement,
     fuse_frame,
     guide_of,
     ratios,
     sweep_frame,
     sweep_weight,
 )
+from coliags_plugin.reconstruction.structure.features import Pose
 
 log = logging.getLogger(__name__)
 
@@ -157,6 +160,7 @@ class Estimation:
                     f"medians-{number}",
                     lambda: [float(np.median(self.result(index)[0])) for index in range(len(self.frames))],
                 )
+            self._choose(neighbours)
         finally:
             cv2.setNumThreads(threads)
 
@@ -187,7 +191,7 @@ class Estimation:
         return neighbours
 
     def _sweep(self, number: int, sweep: Sweep, neighbours: Sequence[Sequence[int]]) -> None:
-        base, guides = self.last, self._guides(sweep.reduction)
+        base, guides = f"fused-{number - 1}", self._guides(sweep.reduction)
         factors = ratios(sweep, (self.range.near, self.range.far))
 
         def swept(index: int) -> Arrays:
@@ -206,7 +210,7 @@ class Estimation:
 
     def _fuse(self, number: int, sweep: Sweep, neighbours: Sequence[Sequence[int]]) -> None:
         swept, guides = self.last, self._guides(sweep.reduction)
-        low, high = np.log(self.range.near), np.log(self.range.far)
+        low, high = math.log(self.range.near), math.log(self.range.far)
 
         @lru_cache(maxsize=self.held)
         def depth_map(index: int) -> WeightedDepth:
@@ -239,7 +243,39 @@ class Estimation:
                 confidence[:] = 0.0
             return {"depth": np.exp(log_depth), "confidence": confidence, "distrust": np.array(distrust)}
 
-        self._stage(f"fused-{number}", fused, f"fuse {number + 1}")
+        self._stage(f"fused-{number}", fused, f"fuse {number + 1}", spent=[swept])
+
+    def _choose(self, neighbours: Sequence[Sequence[int]]) -> None:
+        """Give each frame the depth, of its first sweep or of its last, that agrees better with its neighbours'.
+
+        Small windows at full size see more, unless poses are wrong by about as much as these are wide.
+        """
+        import cv2
+
+        first, last = (f"fused-{number}" for number in (0, len(SWEEPS) - 1))
+        guides = self._guides(SWEEPS[-1].reduction)
+
+        @lru_cache(maxsize=2 * self.held)
+        def depth_map(stage: str, index: int) -> WeightedDepth:
+            arrays = self.work.load(stage, index)
+            depth = np.where(arrays["confidence"] > 0.0, arrays["depth"], np.float32(np.nan))
+            pose = Pose.of(self.frames[index].camera, (depth.shape[1], depth.shape[0]))
+            return WeightedDepth(pose, depth, np.ones_like(depth))
+
+        def chosen(index: int) -> Arrays:
+            arrays = self.work.load(last, index)
+            of_first, of_last = (
+                disagreement(depth_map(stage, index), [depth_map(stage, other) for other in neighbours[index]])
+                for stage in (first, last)
+            )
+            if of_first < of_last < math.inf:
+                guide, before = guides(index), self.work.load(first, index)
+                size = guide.intensity.shape[::-1]
+                arrays["depth"] = smooth_surface(before["depth"], guide.intensity)
+                arrays["confidence"] = cv2.resize(before["confidence"], size, interpolation=cv2.INTER_LINEAR)
+            return arrays
+
+        self._stage("chosen", chosen, "choose", spent=[first, last])
 
     def _guides(self, reduction: int) -> Callable[[int], Guide]:
         """Frames prepared for matching, the last ones held."""
@@ -250,7 +286,7 @@ class Estimation:
 
         return guide
 
-    def _stage(self, stage: str, function: Callable[[int], Arrays], title: str) -> None:
+    def _stage(self, stage: str, function: Callable[[int], Arrays], title: str, spent: Sequence[str] = ()) -> None:
         def one(index: int) -> None:
             if not self.work.file(stage, index).is_file():
                 self.work.save(stage, index, function(index))
@@ -259,8 +295,8 @@ class Estimation:
         if not marker.is_file():
             parallel_map(one, range(len(self.frames)), title, self.progress, self.jobs)
             atomic_write(marker, "")
-            if self.last:  # this stage was made from it
-                shutil.rmtree(self.work.path / self.last, ignore_errors=True)
+            for earlier in spent:
+                shutil.rmtree(self.work.path / earlier, ignore_errors=True)
         self.last = stage
 
 

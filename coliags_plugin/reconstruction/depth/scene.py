@@ -28,7 +28,7 @@ log = logging.getLogger(__name__)
 #: Confidence from which a pixel counts as known in the summary.
 _KNOWN = 0.5
 #: Changes when the results of the same request do, so that old work files are not mixed with new ones.
-_VERSION = 6
+_VERSION = 7
 #: Edge of the voxels of points, pixels on the surface.
 _VOXEL = 2.0
 

@@ -166,23 +166,43 @@ def fuse_frame(frame: WeightedDepth, neighbours: Sequence[WeightedDepth], agreem
     Returns the z-depth, the frame's own where no other counts; the weight of the frames that agree with it; and the
     mean relative deviation within the group.
     """
-    from coliags_plugin.core.numba_kernels.lanes import WIDTH
-    from coliags_plugin.reconstruction.depth.numba_kernels.kernels import reproject, vote
+    from coliags_plugin.reconstruction.depth.numba_kernels.kernels import vote
 
-    height, width = frame.depth.shape
-    size = height * width
-    rest = (0, -size % WIDTH)
-    depth, weight = np.pad(frame.depth.ravel(), rest), np.pad(frame.weight.ravel(), rest)
+    depth, candidates, trusts = _depths_by(neighbours, frame)
+    weight = np.pad(frame.weight.ravel(), (0, len(depth) - frame.weight.size))
+    written = np.empty((3, len(depth)), np.float32)
+    vote(depth, weight, candidates, trusts, np.float32(agreement), *written)
+    fused, votes, spread = written[:, : frame.depth.size].reshape(3, *frame.depth.shape)
+    return fused, votes, spread
+
+
+#: Largest difference of log depth that counts: beyond, one frame may see what is hidden from the other.
+_HIDDEN = 0.1
+
+
+def disagreement(frame: WeightedDepth, neighbours: Sequence[WeightedDepth]) -> float:
+    """Mean difference of a frame's log depth from its neighbours', each up to 0.1; infinite if none sees its pixels."""
+    depth, candidates, _ = _depths_by(neighbours, frame)
+    ratio = (candidates / depth)[np.isfinite(candidates)]
+    return float(np.minimum(np.abs(np.log(ratio)), _HIDDEN).mean()) if len(ratio) else math.inf
+
+
+def _depths_by(
+    neighbours: Sequence[WeightedDepth], frame: WeightedDepth
+) -> tuple[Float32[np.ndarray, "P"], Float32[np.ndarray, "N P"], Float32[np.ndarray, "N P"]]:
+    """z-depth of a frame's pixels and zeros up to a multiple of sixteen; the same by its neighbours, with weights."""
+    from coliags_plugin.core.numba_kernels.lanes import WIDTH
+    from coliags_plugin.reconstruction.depth.numba_kernels.kernels import reproject
+
+    width, size = frame.depth.shape[1], frame.depth.size
+    depth = np.pad(frame.depth.ravel(), (0, -size % WIDTH))
     candidates = np.empty((len(neighbours), len(depth)), np.float32)
     trusts = np.empty_like(candidates)
     for index, other in enumerate(neighbours):
         there, back = frame.pose.homography(other.pose), frame.pose.depth_from(other.pose)
         outputs = candidates[index], trusts[index]
         reproject(depth, width, other.depth, other.weight, *there, *back, _ITERATIONS, np.float32(_CONVERGED), *outputs)
-    written = np.empty((3, len(depth)), np.float32)
-    vote(depth, weight, candidates, trusts, np.float32(agreement), *written)
-    fused, votes, spread = written[:, :size].reshape(3, height, width)
-    return fused, votes, spread
+    return depth, candidates, trusts
 
 
 #: Of the regression: constant, log support, log spread, near side of an edge, log depth across a window.

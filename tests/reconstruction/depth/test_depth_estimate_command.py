@@ -20,6 +20,7 @@ from coliags_plugin.core.scene_files import write_unit
 from coliags_plugin.datamanagers.file_formats import read_gray
 from coliags_plugin.datamanagers.fusion import load_points
 from coliags_plugin.engine.data_formats import open_scene
+from coliags_plugin.reconstruction.depth import estimate
 from coliags_plugin.reconstruction.depth.estimate import Estimation, WorkFolder, check_video
 from tests import commands
 from tests.commands import run
@@ -172,6 +173,25 @@ def test_resuming_with_more_threads_gives_the_same_bytes(wall, estimated, tmp_pa
     assert not set(saved) & set(again)
     assert contents(out) == contents(estimated)
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
+def test_frames_keep_the_sweep_whose_depth_agrees_better(wall, tmp_path, monkeypatch):
+    """Here the smaller one, which is the first."""
+    saved, save = {}, WorkFolder.save
+
+    def kept(self, stage, index, arrays):
+        saved[stage, index] = dict(arrays)
+        save(self, stage, index, arrays)
+
+    monkeypatch.setattr(WorkFolder, "save", kept)
+    monkeypatch.setattr(estimate, "disagreement", lambda frame, neighbours: float(frame.depth.size))
+    assert run("depth", "estimate", wall, "--output", tmp_path / "out", *OPTIONS) == 0
+    for index in range(COUNT):
+        first, last, chosen = (saved[stage, index] for stage in ("fused-0", "fused-1", "chosen"))
+        for name, tolerance in (("depth", 0.4), ("confidence", 1e-6)):
+            resized = cv2.resize(first[name], last[name].shape[::-1])
+            assert np.median(np.abs(chosen[name] - resized)) < tolerance
+            assert not np.array_equal(chosen[name], last[name])
 
 
 def test_work_files_of_other_options_are_not_used(wall, tmp_path, monkeypatch, caplog):

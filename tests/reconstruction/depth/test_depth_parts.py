@@ -29,6 +29,7 @@ from coliags_plugin.reconstruction.depth.sweeping import (
     Sweep,
     WeightedDepth,
     depth_confidence,
+    disagreement,
     fuse_frame,
     guide_of,
     ratios,
@@ -393,15 +394,31 @@ def test_votes():
     assert voted(10.0, [np.nan])[:2] == [10.0, 1.0]
 
 
+def true_maps() -> list[WeightedDepth]:
+    """True depth of five frames."""
+    cameras = [frame.camera for frame in wall_frames(sideways(5))]
+    depths = [wall_depth(camera).astype(np.float32) for camera in cameras]
+    return [WeightedDepth(Pose.of(camera), z, np.ones_like(z)) for camera, z in zip(cameras, depths, strict=True)]
+
+
 def test_fusion_repairs_a_wrong_depth():
-    frames = wall_frames(sideways(5))
-    maps = []
-    for frame in frames:
-        depth = wall_depth(frame.camera).astype(np.float32)
-        maps.append(WeightedDepth(Pose.of(frame.camera), depth, np.ones_like(depth)))
+    maps = true_maps()
     truth = maps[2].depth.copy()
     maps[2].depth[30:40, 40:50] *= 1.04
     fused, votes, _ = fuse_frame(maps[2], [maps[k] for k in (0, 1, 3, 4)], 0.02)
     inner = (slice(8, -8), slice(12, -12))
     np.testing.assert_allclose(fused[inner], truth[inner], rtol=3e-3)
     assert votes[20, 45] == 5.0 and votes[35, 45] == 4.0
+
+
+@pytest.mark.parametrize(("factor", "expected"), [(1.0, 0.0), (1.03, np.log(1.03)), (0.98, -np.log(0.98)), (1.5, 0.1)])
+def test_frames_disagree_by_the_log_of_a_factor_on_depth_up_to_a_tenth(factor, expected):
+    middle, *others = [true_maps()[k] for k in (2, 0, 1, 3, 4)]
+    scaled = dataclasses.replace(middle, depth=np.float32(factor) * middle.depth)
+    assert disagreement(scaled, others) == pytest.approx(expected, abs=2e-3)
+
+
+def test_frames_that_see_nothing_of_each_other_do_not_agree():
+    middle, other = true_maps()[:2]
+    unknown = dataclasses.replace(other, depth=np.full_like(other.depth, np.nan))
+    assert disagreement(middle, [unknown]) == disagreement(middle, []) == np.inf
