@@ -71,6 +71,7 @@ class MethodConfig(Settings):
 
     description: str = ""  # one line; not inherited
     datamanager: DataManagerNode  # reads the data
+    agreed_depth: bool = False  # whether the training depth is made what frames agree on (docs/methods.md 4.14)
     field: FieldNode  # what is trained
     renderer: RendererNode  # draws it
     near_plane: float = Field(default=NEAR_PLANE, ge=0)  # z-depth up to which nothing is drawn, scene units

@@ -19,6 +19,8 @@ from coliags_plugin.core.scenes import Frame, PointCloud
 
 log = logging.getLogger(__name__)
 
+#: Source of points that are fused from depth, as it is recorded.
+DEPTH_POINTS = "depth of the training frames"
 #: Confidence from which on estimated depth makes initial points.
 _TRUSTED = 0.5
 

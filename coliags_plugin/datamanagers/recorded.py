@@ -38,7 +38,7 @@ from coliags_plugin.core.scene_files import (
 from coliags_plugin.core.scenes import Frame, PointCloud, Scene
 from coliags_plugin.core.settings import Settings
 from coliags_plugin.core.splits import Split, divide
-from coliags_plugin.datamanagers.fusion import fuse_depth, load_points, subsampled
+from coliags_plugin.datamanagers.fusion import DEPTH_POINTS, fuse_depth, load_points, subsampled
 from coliags_plugin.datamanagers.shots import PAPER_SIZE, Rectification, Shot, StoredPixels, fitted
 from coliags_plugin.geometry.lenses.models import Lens, PinholeLens
 from coliags_plugin.geometry.poses.c3vd import C3vdPoses, read_poses
@@ -401,7 +401,7 @@ class RecordedDataManager(DataManager):
             read_points = None
         if has_depth and (settings.initial_points == "depth" or read_points is None):
             points = fuse_depth(train, settings.points_count, generator, progress)
-            return points, PointsRecord(source="depth of the training frames", count=len(points), seed=settings.seed)
+            return points, PointsRecord(source=DEPTH_POINTS, count=len(points), seed=settings.seed)
         if read_points is None or source is None:
             missing = POINTS_FILE if source is None else source.name
             from_file = "`datamanager.initial_points=file` and `datamanager.points_file=FILE`"

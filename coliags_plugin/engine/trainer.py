@@ -30,6 +30,7 @@ from coliags_plugin.core.json_files import JsonObject
 from coliags_plugin.core.render_output import BLANK_ALPHA, RenderOutput, concatenate_pixels
 from coliags_plugin.core.scenes import Frame, Scene, Target, View, concatenate_targets
 from coliags_plugin.core.tensors import masked_mean, sent
+from coliags_plugin.datamanagers.agreement import agreed_depth
 from coliags_plugin.engine import checkpoints
 from coliags_plugin.engine.costs import CostMeter, HeapTrimmer, TrainingCost
 from coliags_plugin.engine.data_formats import at_scale, load_method_for, load_scene, training_scale
@@ -74,7 +75,10 @@ class Trainer:
         field: Field | None = None,
     ) -> None:
         config = method.config
-        scene = scene.with_near_plane(config.near_plane)
+        scene, self.agreement = scene.with_near_plane(config.near_plane), None
+        if config.agreed_depth:
+            scene, self.agreement = agreed_depth(scene)
+            logger.info("depth of %s: %s", scene.name, self.agreement or "of too few frames to be compared")
         self.method, self.scene, self.scene_path, self.run = method, scene, scene_path, run
         self.seed, self.device = seed, device
         self.steps = config.schedule.steps
@@ -268,6 +272,7 @@ class Trainer:
                 "extent": scene.extent,
                 "pixel_footprint": footprint if math.isfinite(footprint) else None,  # without points there is none
                 "points": len(scene.points),
+                **({} if self.agreement is None else {"agreement": self.agreement.record}),
                 "provenance": scene.provenance.record(),
             },
             "plan": self.strategy.plan(),
