@@ -267,6 +267,19 @@ class AppearanceHead(Head[SettingsT]):
         """True if :meth:`forward` and :meth:`apply_light` are given the normals of the wall; default: not."""
         return False
 
+    def shadows(
+        self, positions: Float[Tensor, "N 3"], opacities: Float[Tensor, "N"], sizes: Float[Tensor, "N"], camera: Camera
+    ) -> Float[Tensor, "N 3"] | None:
+        """Factors of the colours where children keep the light of the camera's lamps from others; None: none do.
+
+        Args:
+            positions: Of the children, world frame, scene units. [N, 3]
+            opacities: [N]
+            sizes: Median standard deviations, scene units. [N]
+            camera: From which they are seen.
+        """
+        return None
+
     def prepare(self, scene: Scene, distances: Float[Tensor, "D"]) -> None:
         """Adapt the initial parameters to the scene, before training.
 

@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from coliags_plugin.core.scenes import Frame, Scene
+from coliags_plugin.core.shadows import find_lamps
 from coliags_plugin.core.tensors import wall_normals, zero_outside
 
 #: Approximate number of patches, and the nearest of them that tell how large one is.
@@ -109,6 +110,7 @@ class LightFit:
     cosine_exponents: Float[Tensor, "3"]  # of cos(psi), psi the angle at the lamp to the optical axis, for each colour
     incidence_exponents: Float[Tensor, "3"]  # of the cosine of the angle of incidence, for each colour
     albedo: float  # of the wall in green light, in which it lights itself
+    lamps: Float[Tensor, "K 4"]  # that cast shadows: offsets as above, shares of the light that is missing there
 
 
 @dataclass(frozen=True)
@@ -121,6 +123,11 @@ class _Observations:
     normals: Float[Tensor, "P F 3"]  # in camera axes, towards the cameras that see them
     lit: Bool[Tensor, "P F"]  # where nothing that is seen keeps the lamp's light from them
     cavity: Cavity  # the wall that they are of
+
+    @property
+    def distance(self) -> float:
+        """Median distance of what is usable, scene units."""
+        return float(self.sights.norm(dim=-1)[self.usable[..., _GREEN]].median())
 
     def rays(self, offset: Float[Tensor, "3"]) -> tuple[Float[Tensor, "P F"], Float[Tensor, "P F 2"]]:
         """Distances to a lamp at an offset, and cosines of the angles to its axis and to the normals."""
@@ -189,7 +196,10 @@ def _fit_scene(scene: Scene) -> LightFit | None:
     slopes = torch.stack(
         [_fit(rest[..., color], observations.usable[..., color], cosines, gains=False).slopes for color in range(3)]
     ).float()
-    return LightFit(log_gains.float(), parameters[:3].float(), slopes[:, 0], slopes[:, 1], float(parameters[5]))
+    distance = observations.distance
+    logs = observations.logs[..., _GREEN] - observations.light(parameters, distance) - log_gains
+    lamps = find_lamps(scene.train, logs, observations.usable[..., _GREEN], observations.sights, distance)
+    return LightFit(log_gains.float(), parameters[:3].float(), slopes[:, 0], slopes[:, 1], float(parameters[5]), lamps)
 
 
 def _observe(scene: Scene, points: Float[Tensor, "P 3"], normals: Float[Tensor, "P 3"]) -> _Observations:
@@ -243,7 +253,7 @@ def _lamp(obs: _Observations) -> tuple[Float[Tensor, "6"], Float[Tensor, "F"]]:
     usable = obs.usable[..., _GREEN]
     if not usable.any():
         return obs.logs.new_tensor([0.0, 0.0, 0.0, *_START]), obs.logs.new_zeros(obs.logs.shape[1])
-    scale = float(obs.sights.norm(dim=-1)[usable].median())
+    scale = obs.distance
     at_lens, fit = _descend(obs, scale, obs.logs.new_tensor([0.0, 0.0, 0.0, *_START]), range(3, 6))
     beside, better = _descend(obs, scale, at_lens, range(6))
     if better.deviation < _MAX_RESIDUAL_RATIO * fit.deviation:

@@ -178,16 +178,12 @@ def _sharpness(frames: Sequence[Frame]) -> float:
 def _meeting(view: _View, other: _View, surface: Float[Tensor, "H W"]) -> Float[Tensor, "H W"]:
     """Depths at which the rays of a view meet the surface of another; NaN where they do not, or it is not known."""
     camera, target = (each.to("cpu", torch.float64) for each in (view.camera, other.camera))
-    motion = (target.camera_to_world.inverse() @ camera.camera_to_world).float()
-    rows, columns = view.depth.shape
-    x = (torch.arange(columns) + 0.5 - camera.cx) / camera.fx
-    y = (torch.arange(rows) + 0.5 - camera.cy) / camera.fy
-    turn, shift = motion[:3, :3], motion[:3, 3]
-    directions = [(turn[axis, 0] * x)[None] + (turn[axis, 1] * y)[:, None] + turn[axis, 2] for axis in range(3)]
+    axes = target.camera_to_world[:3, :3]
+    directions, shift = (camera.rays() @ axes).float(), ((camera.center - target.center) @ axes).float()
     height, width = surface.shape
     depth, ratio = view.depth, torch.full_like(view.depth, torch.nan)
     for _ in range(_ITERATIONS):
-        right, down, ahead = (direction * depth + offset for direction, offset in zip(directions, shift, strict=True))
+        right, down, ahead = (directions * depth[..., None] + shift).unbind(-1)
         ahead = torch.where(ahead > 0, ahead, torch.nan)
         u = (target.fx * right / ahead + target.cx - 0.5) * (2 / (width - 1)) - 1
         v = (target.fy * down / ahead + target.cy - 0.5) * (2 / (height - 1)) - 1

@@ -224,7 +224,7 @@ def _check_data(scene: Scene, losses: Mapping[str, Loss]) -> None:
         for missing in sorted(loss.needs - there):
             instead = ""
             if missing == "depth":
-                of_points = ", train the method coliags-sparse-depth on its points" if "sparse_depth" in there else ""
+                of_points = ", train the method coliags-plus on its points" if "sparse_depth" in there else ""
                 instead = f"{of_points}, or make a scene with depth: coliags depth estimate"
             raise InputError(
                 f"loss term '{key}' needs {_DATA.get(missing, missing)}, and no training frame of scene "
@@ -258,7 +258,7 @@ def _warn_of_trusted_estimates(scene: Scene, losses: Mapping[str, Loss]) -> None
     if trusting and any(frame.depth_confidence is not None for frame in scene.train):
         log.warning(
             "the depth of scene '%s' is estimated, and loss term '%s' takes it for true, weighted by its confidence; "
-            "the method coliags-in-vivo is made for such scenes",
+            "the method coliags-plus is made for such scenes",
             scene.name,
             trusting[0],
         )

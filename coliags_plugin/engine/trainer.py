@@ -78,7 +78,7 @@ class Trainer:
         scene, self.agreement = scene.with_near_plane(config.near_plane), None
         if config.agreed_depth:
             scene, self.agreement = agreed_depth(scene)
-            logger.info("depth of %s: %s", scene.name, self.agreement or "of too few frames to be compared")
+            logger.info("depth of %s: %s", scene.name, self.agreement or "in too few frames to be compared")
         self.method, self.scene, self.scene_path, self.run = method, scene, scene_path, run
         self.seed, self.device = seed, device
         self.steps = config.schedule.steps

@@ -196,6 +196,10 @@ class AnchorField(GaussianField[AnchorFieldSettings]):
         if self.normals is not None:
             normals = self.normals.index_select(0, drawn.source_index // self.settings.children)
         lit = self.appearance_head.apply_light(drawn.colors, drawn.means, normals, camera, light)
+        if light is None:
+            sizes = drawn.scales.detach().median(dim=1).values
+            shadows = self.appearance_head.shadows(drawn.means, drawn.opacities, sizes, camera)
+            lit = lit if shadows is None else lit * shadows
         return Gaussians(**{**drawn._asdict(), "colors": lit}, visible_sources=visible)
 
     def _children(self, camera: Camera, light: HeldLight | None) -> tuple[DrawnChildren, Int[Tensor, "V"]]:

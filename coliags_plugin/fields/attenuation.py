@@ -17,6 +17,7 @@ from coliags_plugin.core.lamps import HeldLight
 from coliags_plugin.core.photometry import fit_light
 from coliags_plugin.core.scenes import Scene
 from coliags_plugin.core.settings import Settings
+from coliags_plugin.core.shadows import MOST_LAMPS, lit_shares
 from coliags_plugin.core.tensors import fit_kernels
 
 #: Largest distance of the lamp from the optical centre along each camera axis, scene units (mm).
@@ -26,6 +27,8 @@ MAX_OFFSET = 20.0
 _MIN_DISTANCE, _MIN_COSINE, _MIN_INCIDENCE = 0.02, 0.05, 0.1
 #: Largest b and c that a fit may start with: cos^9 in linear light.
 _LARGEST_EXPONENT = 4.0
+#: Initial logit of the share of light that is missing in a shadow.
+_INITIAL_SHADOW = -0.5
 #: Fewer Gaussians are left to PyTorch by the kernels.
 _FEWEST = 16
 
@@ -41,6 +44,7 @@ class AttenuatedAppearanceSettings(Settings):
     initial: Literal["given", "points"] = "given"
     # exponents for each colour, or one pair for all: red falls off slower (docs/methods.md 3.7)
     channels: Literal[1, 3] = 3
+    shadows: bool = False  # whether lamps beside the lens, where points tell of any, cast shadows (docs/methods.md 3.9)
 
 
 class AttenuatedAppearanceHead(AppearanceHead[AttenuatedAppearanceSettings]):
@@ -54,11 +58,15 @@ class AttenuatedAppearanceHead(AppearanceHead[AttenuatedAppearanceSettings]):
         exponents: a, b and c of each channel; without c where incidence does not count. [C, 3] or [C, 2]
         lamp_offset: Of the lamp in camera axes, before it is bounded to +-:data:`MAX_OFFSET`, scene units. [3]
         reference: d_0, scene units. []
+        lamps: Offsets of the lamps that cast shadows, camera axes, scene units, and their shares; those of share 0 are
+            none. [L, 4]
+        shadow: Logits of the share of light that is missing in a whole shadow, for each colour. [3]
     """
 
     decoding = "networks"
 
     reference: Tensor
+    lamps: Tensor
 
     def __init__(
         self, settings: AttenuatedAppearanceSettings, features: int, children: int, generator: torch.Generator
@@ -73,6 +81,9 @@ class AttenuatedAppearanceHead(AppearanceHead[AttenuatedAppearanceSettings]):
         self.exponents = nn.Parameter(torch.tensor(initial).repeat(settings.channels, 1))
         self.lamp_offset = nn.Parameter(torch.zeros(3))
         self.register_buffer("reference", torch.ones(()))
+        if settings.shadows:
+            self.shadow = nn.Parameter(torch.full((3,), _INITIAL_SHADOW))
+            self.register_buffer("lamps", torch.zeros(MOST_LAMPS, 4))
 
     @property
     def uses_normals(self) -> bool:
@@ -93,10 +104,13 @@ class AttenuatedAppearanceHead(AppearanceHead[AttenuatedAppearanceSettings]):
             bounded = fitted_exponents.clamp(0.0, _LARGEST_EXPONENT)
             self.exponents[:, column] = bounded.mean() if self.settings.channels == 1 else bounded
         self.lamp_offset.copy_(MAX_OFFSET * torch.atanh((fitted.lamp_offset / MAX_OFFSET).clamp(-0.9, 0.9)))
+        if self.settings.shadows:
+            self.lamps[: len(fitted.lamps)] = fitted.lamps
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
-        """Groups of the head, of the exponents, and of the lamp's offset, which needs a rate in scene units."""
-        return {**self.head.parameter_groups(), "attenuation": [self.exponents], "lamp_offset": [self.lamp_offset]}
+        """Groups of the head, of exponents, of the lamp's offset, which needs a rate in scene units, and of shadows."""
+        groups = {**self.head.parameter_groups(), "attenuation": [self.exponents], "lamp_offset": [self.lamp_offset]}
+        return {**groups, "shadow": [self.shadow]} if self.settings.shadows else groups
 
     def networks(self, anchors: SeenAnchors) -> HeadNetworks:
         """Networks of the head below."""
@@ -149,6 +163,16 @@ class AttenuatedAppearanceHead(AppearanceHead[AttenuatedAppearanceSettings]):
         incidences = None if facing is None else (facing * rays).sum(1).abs() / distances
         return colors * self.law(distances, rays @ camera.optical_axis / distances, incidences)
 
+    def shadows(
+        self, positions: Float[Tensor, "N 3"], opacities: Float[Tensor, "N"], sizes: Float[Tensor, "N"], camera: Camera
+    ) -> Float[Tensor, "N 3"] | None:
+        """One less the learned share of each colour times the share of the lamps' light that is missing."""
+        lamps = [lamp for lamp in self.lamps if lamp[3] > 0] if self.settings.shadows else []
+        if not lamps:
+            return None
+        lit = [lamp[3] * lit_shares(positions, opacities, sizes, camera, lamp[:3]) for lamp in lamps]
+        return 1.0 - (1.0 - torch.stack(lit).sum(0))[:, None] * self.shadow.sigmoid()
+
     @property
     def learned(self) -> JsonObject:
         """The law's numbers."""
@@ -157,4 +181,9 @@ class AttenuatedAppearanceHead(AppearanceHead[AttenuatedAppearanceSettings]):
             **dict(zip(names, self.exponents.detach().T.tolist(), strict=False)),
             "lamp_offset": self.offset.detach().tolist(),
             "reference_distance": float(self.reference),
+            **(
+                {"lamps": self.lamps.tolist(), "shadow": self.shadow.sigmoid().tolist()}
+                if self.settings.shadows
+                else {}
+            ),
         }

@@ -167,87 +167,62 @@ class DistanceL1Loss(Loss[DistanceL1Settings]):
         return error / step.model.field.length_unit if self.settings.unit == "field" else error
 
 
-class EstimatedDepthSettings(LossSettings):
-    """Options of the loss against estimated depth."""
-
-    depth: DepthKind = "depth_accumulated"  # rendered depth that is compared; depth_median has no gradient
-    floor: float = Field(default=0.1, ge=0.0, le=1.0)  # weight of a pixel whose confidence is lower than this
-    # Huber threshold of the relative difference: smaller ones are squared and divided by twice this
-    delta: float = Field(default=0.05, gt=0.0)
+#: Least weight of a pixel of estimated depth, and the relative difference at which Huber's function becomes linear.
+_LEAST_CONFIDENCE, _HUBER = 0.1, 0.05
+#: What a single point adds at most, as a relative difference.
+_POINT_BOUND = 0.1
 
 
-class EstimatedDepthLoss(Loss[EstimatedDepthSettings]):
-    """Mean of max(c, floor) h(|D - z| / z) over the valid pixels of known depth z of confidence c.
+class SceneDepthLoss(Loss):
+    """Difference from whatever depth a frame has, relative, so that it needs no unit of length (docs/methods.md 4.5).
 
-    h is Huber's function with slope 1 beyond ``delta`` (docs/methods.md 4.6). Relative to z, it needs no unit of
-    length. Divided by the number of pixels, not by the sum of weights, so that a frame of nothing but prior depth
-    guides weakly, too. Depth without confidence counts as certain.
+    D is the accumulated depth, z the frame's, x = |D - z| / z.
+
+    - True depth: the mean of |D - z| over the mean of z, of the valid pixels.
+    - Estimated depth: the mean of max(c, 0.1) h(x), c the confidence and h Huber's function with slope 1 beyond 5 %.
+      Divided by the number of pixels, not by the sum of weights, so that a frame of nothing but prior depth guides
+      weakly, too.
+    - Depth at single points: the mean of 0.1 (1 - exp(-x / 0.1)), whose slope falls from 1 to 0: outliers hardly pull.
+      D / alpha is interpolated bilinearly at a point, with border pixels replicated; a point counts if all
+      interpolated pixels are valid and have alpha > 0 (after DS-NeRF, Deng et al., CVPR 2022).
+    - Without any of these it is 0.
     """
 
-    needs: ClassVar[frozenset[str]] = frozenset({"depth"})
-
-    @property
-    def wants(self) -> frozenset[str]:
-        """The rendered depth that is compared."""
-        return frozenset({self.settings.depth})
-
-    def __call__(self, step: TrainingStep) -> Float[Tensor, ""]:
-        """The unweighted term; 0 where no valid pixel has a depth."""
-        depth, has_depth = _known_depth(step.target)
-        has_depth = has_depth & (depth > 0)
-        rendered, options = step.output[self.settings.depth], self.settings
-        estimate = torch.where(has_depth, depth, 1.0).to(rendered.dtype)
-        rendered, has_depth = _where_drawn(rendered, has_depth, options.depth)
-        relative = (zero_outside(rendered - estimate, has_depth) / estimate).abs()
-        penalty = functional.smooth_l1_loss(relative, torch.zeros_like(relative), reduction="none", beta=options.delta)
-        if step.target.depth_confidence is not None:
-            penalty = penalty * step.target.depth_confidence.to(penalty.dtype).clamp_min(options.floor)
-        return masked_mean(penalty, has_depth)
-
-
-class SparseDepthSettings(LossSettings):
-    """Options of the sparse depth loss."""
-
-    depth: DepthKind = "depth_expected"  # rendered depth that is compared; depth_median has no gradient
-    relative: bool = False  # differences are divided by the known depth, so that the weight needs no unit of length
-    # what a point adds at most, of the differences' unit: x becomes bound (1 - exp(-x / bound)), whose slope falls from
-    # 1 to 0, so that outliers hardly pull; null: x itself
-    bound: float | None = Field(default=None, gt=0.0)
-
-
-class SparseDepthLoss(Loss[SparseDepthSettings]):
-    """Mean |D(p) - z|, or |D(p) - z| / z, over the points p of a frame whose z-depth is known (docs/methods.md 4.5).
-
-    After DS-NeRF (Deng et al., "Depth-supervised NeRF: Fewer Views and Faster Training for Free", CVPR 2022). D is
-    interpolated bilinearly at a point, with border pixels replicated. A point is used if all interpolated pixels are
-    valid and have alpha > 0.
-    """
-
-    needs: ClassVar[frozenset[str]] = frozenset({"sparse_depth"})
     whole_image: ClassVar[bool] = True
 
     @property
     def wants(self) -> frozenset[str]:
-        """The rendered depth that is compared."""
-        return frozenset({self.settings.depth})
+        """The accumulated depth."""
+        return frozenset({"depth_accumulated"})
 
     def __call__(self, step: TrainingStep) -> Float[Tensor, ""]:
-        """The unweighted term, scene units unless ``relative``; 0, still part of the graph, if no point is used."""
-        rendered, points = step.output[self.settings.depth], step.target.sparse_depth
-        if points is None or not len(points.depth):
-            return rendered.reshape(-1)[:0].sum()
-        drawn = (step.output.alpha > 0) & step.target.valid & torch.isfinite(rendered)
-        rendered, drawn = _where_drawn(rendered, drawn, self.settings.depth)
-        sampled, counts = interpolated(rendered, drawn, points.pixels)
-        truth = points.depth.to(rendered.dtype)
-        if self.settings.relative:
-            counts = counts & (truth > 0)
-        difference = torch.where(counts, sampled - truth, 0.0).abs()
-        if self.settings.relative:
-            difference = difference / torch.where(counts, truth, 1.0)
-        if self.settings.bound is not None:
-            difference = -self.settings.bound * torch.expm1(-difference / self.settings.bound)
-        return difference.sum() / counts.sum().clamp_min(1)
+        """The unweighted term; 0, still part of the graph, where nothing is to be compared."""
+        target, rendered = step.target, step.output["depth_accumulated"]
+        if target.depth is None:
+            return _difference_at_points(rendered, step.output.alpha, target)
+        has_depth = torch.isfinite(target.depth) & target.valid & (target.depth > 0)
+        truth = torch.where(has_depth, target.depth, 1.0).to(rendered.dtype)
+        differences = zero_outside(rendered - truth, has_depth).abs()
+        if target.depth_confidence is None:
+            return masked_mean(differences, has_depth) / masked_mean(truth, has_depth).clamp_min(1e-9)
+        relative = differences / truth
+        robust = functional.smooth_l1_loss(relative, torch.zeros_like(relative), reduction="none", beta=_HUBER)
+        return masked_mean(robust * target.depth_confidence.to(robust.dtype).clamp_min(_LEAST_CONFIDENCE), has_depth)
+
+
+def _difference_at_points(
+    rendered: Float[Tensor, "H W"], alpha: Float[Tensor, "H W"], target: Target
+) -> Float[Tensor, ""]:
+    """Bounded mean relative difference of expected depth from the depths of a frame's points."""
+    points = target.sparse_depth
+    if points is None or not len(points.depth):
+        return rendered.reshape(-1)[:0].sum()
+    drawn = (alpha > 0) & target.valid & torch.isfinite(rendered)
+    sampled, counts = interpolated(rendered / torch.where(drawn, alpha, 1.0), drawn, points.pixels)
+    truth = points.depth.to(rendered.dtype)
+    counts = counts & (truth > 0)
+    relative = torch.where(counts, sampled - truth, 0.0).abs() / torch.where(counts, truth, 1.0)
+    return (-_POINT_BOUND * torch.expm1(-relative / _POINT_BOUND)).sum() / counts.sum().clamp_min(1)
 
 
 def _known_depth(target: Target) -> tuple[Float[Tensor, "H W"], Bool[Tensor, "H W"]]:
@@ -259,16 +234,6 @@ def _known_depth(target: Target) -> tuple[Float[Tensor, "H W"], Bool[Tensor, "H 
             "Remove that term, for instance with `losses.depth=null`",
         )
     return target.depth, torch.isfinite(target.depth) & target.valid
-
-
-def _where_drawn(
-    rendered: Float[Tensor, "H W"], usable: Bool[Tensor, "H W"], kind: str
-) -> tuple[Float[Tensor, "H W"], Bool[Tensor, "H W"]]:
-    """Rendered depth, of inverse depth the reciprocal, and the usable pixels that have one."""
-    if kind != "inverse_depth_accumulated":
-        return rendered, usable
-    usable = usable & (rendered > 0)
-    return _reciprocal(rendered, usable, 1.0), usable
 
 
 def _reciprocal(values: Float[Tensor, "H W"], where: Bool[Tensor, "H W"], otherwise: float) -> Float[Tensor, "H W"]:
