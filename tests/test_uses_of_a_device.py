@@ -26,7 +26,7 @@ pytestmark = pytest.mark.thorough
 #: Methods, and what makes them small and, after two steps, opaque.
 METHODS = {
     "3dgs": {"field.initial_opacity": 0.95, "datamanager.points_count": 400},
-    "coliags-in-vivo": {"field.voxel_size": 4.0, "datamanager.points_count": 300},
+    "coliags-plus": {"field.voxel_size": 4.0, "datamanager.points_count": 300},
     "pr-endo": {"field.initial_opacity": 0.95, "datamanager.points_count": 400},
     "2dgs": {"field.initial_opacity": 0.95, "datamanager.points_count": 400},
     "reim-nerf-small": {"field.width": 16, "sampler.pixels": 64, "renderer.samples": 8},
@@ -58,7 +58,7 @@ def trained(wall, tmp_path_factory):
 
     def on_device(method):
         if method not in folders:
-            folder, steps = tmp_path_factory.mktemp("runs") / method, 8 if method == "coliags-in-vivo" else 2
+            folder, steps = tmp_path_factory.mktemp("runs") / method, 8 if method == "coliags-plus" else 2
             with PretendedCuda():
                 cp.train(method, wall, folder, steps=steps, settings=options_of(method), device="cuda")
             folders[method] = folder
@@ -126,7 +126,7 @@ def test_meshes_and_coverage(method, trained, tmp_path):
 
 @pytest.mark.parametrize(
     ("method", "light"),
-    [("3dgs", "mean"), ("2dgs", "mean"), ("coliags-in-vivo", "flattened"), ("coliags-in-vivo", "recorded")],
+    [("3dgs", "mean"), ("2dgs", "mean"), ("coliags-plus", "flattened"), ("coliags-plus", "recorded")],
 )
 def test_exports(method, light, trained, wall, tmp_path):
     formats = tuple(WRITERS)
@@ -155,7 +155,7 @@ def test_is_shown_in_a_browser(method, trained, tmp_path):
             assert command("view", trained(method), "--output", tmp_path / "page.html", "--device", "cuda") == 0
 
 
-@pytest.mark.parametrize(("first", "method"), [*(("cuda", method) for method in METHODS), ("cpu", "coliags-in-vivo")])
+@pytest.mark.parametrize(("first", "method"), [*(("cuda", method) for method in METHODS), ("cpu", "coliags-plus")])
 def test_checkpoints_are_read_on_either_device(method, first, wall, tmp_path):
     other = {"cuda": "cpu", "cpu": "cuda"}[first]
     with PretendedCuda():

@@ -12,14 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from coliags_plugin.cli.texts import (
-    ESTIMATED_DEPTH_METHOD,
-    coliags,
-    parse_size,
-    print_summary,
-    train_command,
-    view_command,
-)
+from coliags_plugin.cli.texts import coliags, parse_size, print_summary, train_command, view_command
 from coliags_plugin.config import options
 from coliags_plugin.core.errors import InputError
 
@@ -113,7 +106,7 @@ class DataCommand:
             f"{page_text(page)}\n\n{verdict(check)}",
             check.as_json(),
             written=[] if self.html is None else [self.html],
-            then=[train_command(self.scene, assignments=chosen)] if is_ready else [],
+            then=[train_command(self.scene, chosen)] if is_ready else [],
             as_json=self.json,
         )
         if check.findings:
@@ -175,7 +168,7 @@ class DepthCommand:
             )
         for warning in warnings:
             log.warning(warning)
-        train = train_command(self.output, ESTIMATED_DEPTH_METHOD, training_options(scene))
+        train = train_command(self.output, training_options(scene))
         print_summary(summary, written=[self.output], then=[train], as_json=self.json)
 
 
@@ -205,7 +198,7 @@ class ReconstructCommand(options.ReconstructOptions):
     size: options.OptionalText = None
     """Size WxH of the images that depth is estimated from and training sees, pixels; default: what fits 338x270."""
     method: options.OptionalText = None
-    """Method to train; default: coliags-in-vivo, or coliags for a scene with depth."""
+    """Method to train; default: coliags-plus."""
     steps: options.OptionalInt = None
     """Training steps of 100 frames, and at least of the largest sub-map; default 2000 (docs/reconstruct.md 1)."""
     json: options.AsJson = False

@@ -13,8 +13,6 @@ import tyro
 
 from coliags_plugin.core.errors import InputError
 
-#: The method for scenes with estimated depth, as `coliags reconstruct` trains it.
-ESTIMATED_DEPTH_METHOD = "coliags-in-vivo"
 #: An option or setting in a message: `name`, `name=value` or `key.path=value`, in backticks.
 _QUOTED = re.compile(r'`([a-z]\w*(?:\.(?:\w+|"[^"`]*"))*)(?:=([^`]*))?`')
 #: Flags of the running command by names of its options.
@@ -87,16 +85,13 @@ def view_command(run: Path, data: Path | None = None) -> str:
     return coliags("view", run, *(() if data is None else ("--data", data)))
 
 
-def train_command(scene: Path, method: str = "coliags", assignments: Sequence[str] = ()) -> str:
-    """The command that trains a method on a scene with options ``KEY=VALUE``."""
+def train_command(scene: Path, assignments: Sequence[str] = ()) -> str:
+    """The command that trains on a scene with options ``KEY=VALUE``."""
     changes = [word for assignment in assignments for word in ("--set", assignment)]
-    return coliags("train", method, "--data", scene, *changes)
+    return coliags("train", "coliags-plus", "--data", scene, *changes)
 
 
 def depth_commands(scene: Path) -> list[str]:
     """The commands that estimate the depth of a scene with poses and points, and train on it."""
     with_depth = scene.with_name(f"{scene.name}-depth")
-    return [
-        coliags("depth", "estimate", scene, "--output", with_depth),
-        train_command(with_depth, ESTIMATED_DEPTH_METHOD),
-    ]
+    return [coliags("depth", "estimate", scene, "--output", with_depth), train_command(with_depth)]

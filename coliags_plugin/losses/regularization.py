@@ -21,7 +21,7 @@ from coliags_plugin.core.tensors import constant, masked_mean, zero_outside
 class OpacityLoss(Loss):
     """Mean of 1 - alpha over the valid pixels: a colon is closed, so that every ray ends on tissue.
 
-    Without it, a dark lumen is matched as well by nothing in front of the black background (docs/methods.md 4.6).
+    Without it, a dark lumen is matched as well by nothing in front of the black background (docs/methods.md 4.5).
     """
 
     def __call__(self, step: TrainingStep) -> Float[Tensor, ""]:

@@ -48,7 +48,7 @@ class ReconstructionSettings(Settings):
     depth: DepthEstimationSettings = DepthEstimationSettings()  # estimation of dense depth
     # Width and height of the images that depth is estimated from and training sees, pixels. None: what fits 338 x 270.
     size: tuple[Pixels, Pixels] | None = None
-    method: str | None = None  # method to train; None: coliags-in-vivo, or coliags where the scene has depth
+    method: str = "coliags-plus"  # method to train
     # Training steps of 100 frames; a model of other size gets more or fewer in proportion, at most twice as many, at
     # least a quarter, the largest model at least these.
     steps: int = Field(default=2000, ge=1)

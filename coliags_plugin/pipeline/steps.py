@@ -21,7 +21,7 @@ from coliags_plugin.core.errors import InputError, InterruptedRunError, NotWrita
 from coliags_plugin.core.files import write_json
 from coliags_plugin.core.jobs import Progress
 from coliags_plugin.core.scene_files import Unit
-from coliags_plugin.core.scenes import Frame, Scene
+from coliags_plugin.core.scenes import Scene
 from coliags_plugin.datamanagers.colmap import ATLAS_FILE, find_models
 from coliags_plugin.engine import evaluator
 from coliags_plugin.engine.data_formats import UNKNOWN_MEDIAN_DEPTH, open_scene
@@ -168,17 +168,7 @@ class StageContext:
     @cached_property
     def estimates_depth(self) -> bool:
         """True if depth has to be estimated, as the source is no scene, or one without dense depth."""
-        return self.data_format is None or self._first_frame.depth is None
-
-    @property
-    def method(self) -> str:
-        """Name of the method to train: the one given, or else by what is known of the depth."""
-        is_estimate = self.estimates_depth or self._first_frame.depth_confidence is not None
-        return self.settings.method or ("coliags-in-vivo" if is_estimate else "coliags")
-
-    @cached_property
-    def _first_frame(self) -> Frame:
-        return self.open_posed().train[0]
+        return self.data_format is None or self.open_posed().train[0].depth is None
 
 
 def stages_of(context: StageContext) -> list[Stage]:
@@ -205,10 +195,10 @@ def stages_of(context: StageContext) -> list[Stage]:
     stages = [stage("check", check_data, size=settings.size, **source)]
     if context.estimates_depth:
         stages.append(stage("depth", estimate_depth, size=settings.size, depth=settings.depth.model_dump()))
-    load_method(context.method)  # an unknown method is found out before the work starts
+    load_method(settings.method)  # an unknown method is found out before the work starts
     return [
         *stages,
-        stage("train", train, method=context.method, steps=steps_for(context), seed=settings.seed),
+        stage("train", train, method=settings.method, steps=steps_for(context), seed=settings.seed),
         stage("evaluate", evaluate),
         stage("mesh", mesh, mesh=settings.mesh.model_dump()),
         stage("coverage", coverage, coverage=settings.coverage.model_dump()),
@@ -340,7 +330,7 @@ def train(context: StageContext) -> StageRecord:
     if not context.estimates_depth:
         options = [*options, *(f"datamanager.{option}" for option in context.model_options)]
     training = TrainOptions(
-        context.method,
+        settings.method,
         context.scene,
         steps=steps_for(context),
         seed=settings.seed,

@@ -405,7 +405,7 @@ def test_command_says_it_all(folder, scene, tmp_path, capsys):
     out = capsys.readouterr().out
     assert "nothing suspect" in out
     assert "c3vd (undistorted layout)" in out
-    assert out.endswith(f"written: {tmp_path / 'check.html'}\nnext:    coliags train coliags --data {folder}\n")
+    assert out.endswith(f"written: {tmp_path / 'check.html'}\nnext:    coliags train coliags-plus --data {folder}\n")
     assert run(*argv, "--json") == 0
     facts = json.loads(capsys.readouterr().out)
     assert facts["suspect"] is False

@@ -189,10 +189,10 @@ def test_sfm_makes_a_scene_that_trains_and_aligns(tube, tmp_path, capsys, caplog
     assert end == [
         f"written: {out}",
         f"next:    coliags depth estimate {out} --output {out}-depth",
-        f"next:    coliags train coliags-in-vivo --data {out}-depth",
+        f"next:    coliags train coliags-plus --data {out}-depth",
     ]
     assert sorted(path.name for path in (out / "images").iterdir()) == [f"{n:04d}_color.png" for n in range(0, 9, 2)]
-    argv = ("train", "coliags-sparse-depth", "--data", out, "--output", tmp_path / "run", "--renderer", "torch")
+    argv = ("train", "coliags-plus", "--data", out, "--output", tmp_path / "run", "--renderer", "torch")
     assert run(*argv, "--steps", 2, *SETS) == 0
     rows = (tmp_path / "run/metrics.jsonl").read_text().splitlines()
     assert json.loads(rows[-1])["terms"]["depth"] > 0.0

@@ -1,9 +1,7 @@
 """Digests of what short runs of every method end in, to prove that a change of the code changes no result.
 
-    python -m tests.engine.fingerprints --data PHANTOM --sparse COLMAP --out before.json
-    python -m tests.engine.fingerprints --data PHANTOM --sparse COLMAP --out after.json --compare before.json
-
-COLMAP is a phantom in COLMAP's layout, for methods that learn from depth at single points.
+    python -m tests.engine.fingerprints --data PHANTOM --out before.json
+    python -m tests.engine.fingerprints --data PHANTOM --out after.json --compare before.json
 
 Each run is taken to its end, then resumed from its middle and taken there again. Digests are compared without the
 tensors' names, which a refactoring may change. They hold for one machine and one set of library versions.
@@ -81,7 +79,6 @@ def main() -> None:
     """Take the fingerprints, write them, and compare."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, required=True)
-    parser.add_argument("--sparse", type=Path, required=True)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--methods", nargs="*", default=sorted(method_files()))
     parser.add_argument("--seeds", type=int, default=3)
@@ -94,8 +91,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         for method, seed, changes in jobs:
             key = " ".join([method, str(seed), *changes])
-            data = options.sparse if "sparse-depth" in method else options.data
-            fingerprints[key] = fingerprint(data, method, seed, changes, Path(folder))
+            fingerprints[key] = fingerprint(options.data, method, seed, changes, Path(folder))
             verdict = "new" if key not in before else "same" if fingerprints[key] == before[key] else "DIFFERENT"
             print(
                 f"{key}: grown {fingerprints[key]['grown']}, resumed {fingerprints[key]['resumed_alike']} {verdict}",

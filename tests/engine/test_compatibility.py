@@ -99,18 +99,17 @@ def test_the_methods_made_for_such_data_are_named(tmp_path, caplog):
     bare = [frame.with_maps(depth=None) for frame in scene.train]
     with pytest.raises(InputError, match=r"or make a scene with depth: coliags depth estimate") as caught:
         start(tmp_path / "run", method="scaffold-gs-depth", scene=replace(scene, train=bare))
-    assert "coliags-sparse-depth" not in str(caught.value)
+    assert "coliags-plus" not in str(caught.value)
     sparse = [replace(frame, sparse_depth=points) for frame in bare]
-    with pytest.raises(InputError, match=r"train the method coliags-sparse-depth on its points, or .* depth estimate"):
+    with pytest.raises(InputError, match=r"train the method coliags-plus on its points, or .* depth estimate"):
         start(tmp_path / "run", method="scaffold-gs-depth", scene=replace(scene, train=sparse))
-    assert start(tmp_path / "run", method="coliags-sparse-depth", scene=replace(scene, train=sparse))
-    with pytest.raises(InputError, match=r"'depth' needs depth at single points.*losses\.depth=null"):
-        start(tmp_path / "run", method="coliags-sparse-depth")
+    for train in (bare, sparse):
+        assert start(tmp_path / "run", method="coliags-plus", scene=replace(scene, train=train))
     estimated = [frame.with_maps(depth_confidence=torch.ones_like(frame.depth)) for frame in scene.train]
-    for method, warned in (("coliags", True), ("coliags-in-vivo", False), ("scaffold-gs", False)):
+    for method, warned in (("coliags", True), ("coliags-plus", False), ("scaffold-gs", False)):
         caplog.clear()
         start(tmp_path / "run", method=method, scene=replace(scene, train=estimated))
-        assert ("coliags-in-vivo is made for such scenes" in caplog.text) == warned
+        assert ("coliags-plus is made for such scenes" in caplog.text) == warned
     start(tmp_path / "run", method="coliags", scene=scene)
     assert "estimated" not in caplog.text
 

@@ -239,7 +239,7 @@ def renamed(scene):
 
 @pytest.fixture(scope="module")
 def trained(loaded, estimated):
-    return loaded(scene=estimated, steps=4, method="coliags-estimated-depth")
+    return loaded(scene=estimated, steps=4, method="coliags-plus")
 
 
 def test_frames_are_matched_by_name_or_by_index_where_names_differ(true, estimated):
@@ -286,7 +286,7 @@ def test_against_the_truth_they_are_measured(trained, true):
     result, own_result = evaluate(trained, "paper", true), evaluate(trained, "paper")
     assert result.evaluation_name == "paper-truth" and own_result.evaluation_name == "paper"
     assert result.key != own_result.key
-    assert result.title.startswith("coliags-estimated-depth on phantom (trained on estimate), seed 0")
+    assert result.title.startswith("coliags-plus on phantom (trained on estimate), seed 0")
     assert result.scene.name == "phantom" and result.scene.fingerprint == "true" and result.scene.split == "every-8th"
     assert result.mean("psnr") == own_result.mean("psnr")
     assert all(result.mean("depth_mse", name) is not None for name in ("test", "rotation"))

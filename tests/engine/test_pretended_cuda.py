@@ -35,11 +35,9 @@ WAITS = Counter(
 #: Methods and options whose steps are counted: every component that steps use is in one of them.
 STEPS = {
     "coliags": (),
-    "coliags-in-vivo": (),
-    "coliags-plus-sparse-depth": (),
+    "coliags-plus": (),
     "2dgs": (),
     "3dgs-depth": (),
-    "coliags-fast": (),
     "gaussian-pancakes": (),
     "pr-endo": ("field.network_from=0",),
     "reim-nerf-small": ("field.width=16", "sampler.pixels=64"),

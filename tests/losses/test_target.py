@@ -1,4 +1,4 @@
-"""All loss terms alike, and those against a frame: of its image, and of depth, along the ray, estimated, or sparse."""
+"""All loss terms alike, and those against a frame: of its image, and of depth, along the ray, or whatever there is."""
 
 from __future__ import annotations
 
@@ -81,10 +81,8 @@ def evaluate(model):
         rows = {name: torch.rand(count, 3, generator=generator) for name in ("scales", "albedo", "diffuse_factor")}
         rows = {name: values.to(dtype).requires_grad_() for name, values in rows.items()}
         image = torch.randint(0, 256, (ROWS, COLUMNS, 3), generator=generator, dtype=torch.uint8)
-        points = SparseDepth(torch.rand(400, 2, generator=generator) * ROWS, torch.rand(400, generator=generator) + 1)
-        depth = pixels("depth").detach() + 1 if "depth" in loss.needs else None
+        depth = pixels("depth").detach() + 1 if "depth" in loss.needs or name == "scene-depth" else None
         frame = make_frame(image, depth, mask)
-        frame = replace(frame, sparse_depth=points) if "sparse_depth" in loss.needs else frame
         output = make_output(scales=rows.pop("scales"), **drawn)
         splats = replace(output.splats, gaussians=replace(output.splats.gaussians, features=rows))
         output = replace(output, camera=frame.camera, splats=splats)
@@ -252,60 +250,6 @@ def test_pixels_are_weighted_by_their_confidence(name, case):
     assert term == 0.0 and not values.any()
 
 
-# The robust relative loss
-
-
-@pytest.mark.parametrize("floor", [0.0, 0.1, 0.6])
-def test_it_is_hubers_loss_of_the_relative_error(case, floor):
-    output, frame, rendered = case
-    has_depth = frame.mask & frame.depth.isfinite()
-    depth = torch.where(has_depth, frame.depth, 1.0)
-    relative = (output["depth_accumulated"] - depth) / depth
-    penalty = huber_loss(relative, torch.zeros_like(relative), reduction="none", delta=0.05) / 0.05
-    expected = (penalty * frame.depth_confidence.double().clamp_min(floor))[has_depth].mean()
-    term = make("estimated-depth", **({} if floor == 0.1 else {"floor": floor}))(output, frame)
-    assert term.item() == pytest.approx(expected.item(), rel=1e-12)
-    (expected,) = torch.autograd.grad(expected, rendered, retain_graph=True)
-    torch.testing.assert_close(torch.autograd.grad(term, rendered)[0], expected)
-    plain, sure = (frame.with_maps(depth_confidence=each) for each in (None, torch.ones(HEIGHT, WIDTH)))
-    certain = make("estimated-depth")(output, sure).item()
-    assert make("estimated-depth")(output, plain).item() == pytest.approx(certain, rel=1e-12)
-
-
-def test_ignored_and_unknown_pixels_may_be_nan():
-    depth = torch.tensor([[10.0, torch.nan, 0.0, torch.inf, 20.0]])
-    rendered = torch.tensor([[12.0, 5.0, 5.0, 5.0, torch.nan]], requires_grad=True)
-    mask = torch.tensor([[True, True, True, True, False]])
-    frame = make_frame(torch.zeros(1, 5, 3, dtype=torch.uint8), depth, mask)
-    term = make("estimated-depth")(make_output(torch.zeros(1, 5, 3), depth_accumulated=rendered), frame)
-    term.backward()
-    assert term.item() == pytest.approx(0.2 - 0.025)
-    assert rendered.grad[0].tolist() == pytest.approx([0.1, 0, 0, 0, 0])
-
-
-def test_inverse_depth_counts_where_something_was_drawn():
-    inverse = torch.tensor([[0.05, 0.0]], requires_grad=True)
-    output = make_output(torch.zeros(1, 2, 3), inverse_depth_accumulated=inverse)
-    loss = make("estimated-depth", depth="inverse_depth_accumulated")
-    term = loss(output, make_frame(torch.zeros(1, 2, 3, dtype=torch.uint8), torch.tensor([[10.0, 10.0]])))
-    term.backward()
-    assert term.item() == pytest.approx(1.0 - 0.025)
-    assert inverse.grad[0].tolist() == pytest.approx([-1 / (10 * 0.05**2), 0.0])
-    assert loss.loss.wants == {"inverse_depth_accumulated"} and loss.loss.needs == {"depth"}
-
-
-def test_pixel_batches_of_several_frames(case):
-    output, frame, _ = case
-    pixels = torch.stack(torch.meshgrid(torch.arange(WIDTH), torch.arange(HEIGHT), indexing="xy"), -1).reshape(-1, 2)
-    depth = output["depth_accumulated"].detach().reshape(-1, 1).repeat(2, 1)
-    rgb, alpha = torch.zeros(len(depth), 1, 3), torch.ones(len(depth), 1)
-    batch_output = RenderOutput(rgb, alpha, None, {"depth_accumulated": depth})
-    target = concatenate_targets([frame.target_at(pixels), frame.target_at(pixels)])
-    loss = make("estimated-depth").loss
-    batch = loss(step(batch_output, target)).item()
-    assert batch == pytest.approx(make("estimated-depth")(output, frame).item(), rel=1e-12)
-
-
 # The distance along the ray
 
 make_distance = partial(make, "distance-l1")
@@ -363,10 +307,38 @@ def test_a_share_of_each_image_counts_and_is_always_the_same():
     assert not torch.equal(gradient[:, 0] != 0, expected)
 
 
-# Depth at single points: sampling against torch's own, and what counts
+# Whatever depth a scene has: dense, sampled at points against torch's own, and what counts
+
+scene_depth = make("scene-depth")
 
 
-make_sparse = partial(make, "sparse-depth")
+@pytest.mark.parametrize("is_true", [True, False])
+def test_dense_depth_is_compared_in_proportion_to_it(case, is_true):
+    output, frame, rendered = case
+    has_depth = frame.mask & frame.depth.isfinite()
+    truth, difference = frame.depth[has_depth], (rendered - frame.depth)[has_depth]
+    if is_true:
+        frame = frame.with_maps(depth_confidence=None)
+        expected = difference.abs().mean() / truth.mean()
+    else:
+        penalty = huber_loss(difference / truth, torch.zeros_like(truth), reduction="none", delta=0.05) / 0.05
+        expected = (penalty * frame.depth_confidence[has_depth].double().clamp_min(0.1)).mean()
+    term = scene_depth(output, frame)
+    assert term.item() == pytest.approx(expected.item(), rel=1e-12)
+    (expected,) = torch.autograd.grad(expected, rendered, retain_graph=True)
+    torch.testing.assert_close(torch.autograd.grad(term, rendered)[0], expected)
+
+
+@pytest.mark.parametrize(("confidence", "expected"), [(None, 0.2), (torch.ones(1, 5), 0.2 - 0.025)])
+def test_ignored_and_unknown_pixels_may_be_nan(confidence, expected):
+    depth = torch.tensor([[10.0, torch.nan, 0.0, torch.inf, 20.0]])
+    rendered = torch.tensor([[12.0, 5.0, 5.0, 5.0, torch.nan]], requires_grad=True)
+    mask = torch.tensor([[True, True, True, True, False]])
+    frame = make_frame(torch.zeros(1, 5, 3, dtype=torch.uint8), depth, mask).with_maps(depth_confidence=confidence)
+    term = scene_depth(make_output(torch.zeros(1, 5, 3), depth_accumulated=rendered), frame)
+    term.backward()
+    assert term.item() == pytest.approx(expected)
+    assert rendered.grad[0].tolist() == pytest.approx([0.1, 0, 0, 0, 0])
 
 
 @pytest.fixture
@@ -385,39 +357,35 @@ def points():
 def at_points():
     """The loss of a rendered depth at points."""
 
-    def term(rendered, pixels, depth, alpha=None, mask=None, kind="depth_expected", **options):
-        height, width = rendered.shape
-        output = make_output(torch.zeros(height, width, 3), **{kind: rendered})
-        if alpha is not None:
-            output = replace(output, alpha=alpha)
-        frame = make_frame(torch.zeros(height, width, 3, dtype=torch.uint8), mask=mask)
+    def term(rendered, pixels, depth, alpha=None, mask=None):
+        output = make_output(torch.zeros(*rendered.shape, 3), alpha=alpha, depth_accumulated=rendered)
+        frame = make_frame(torch.zeros(*rendered.shape, 3, dtype=torch.uint8), mask=mask)
         points = SparseDepth(torch.as_tensor(pixels), torch.as_tensor(depth))
-        return make_sparse(depth=kind, **options)(output, replace(frame, sparse_depth=points))
+        return scene_depth(output, replace(frame, sparse_depth=points))
 
     return term
 
 
-def test_sampling_is_torchs_with_pixel_centres_at_one_half(at_points, rendered, points):
-    pixels, depth = points
-    size = torch.tensor([WIDTH, HEIGHT])
-    grid = (2 * pixels / size - 1)[None, None]
-    sampled = grid_sample(rendered[None, None], grid, padding_mode="border", align_corners=False)[0, 0, 0]
-    expected = (sampled - depth).abs().mean()
-    term = at_points(rendered, pixels, depth)
-    assert term.item() == pytest.approx(expected.item(), abs=1e-12)
-    (gradient,) = torch.autograd.grad(expected, rendered, retain_graph=True)
-    term.backward()
-    torch.testing.assert_close(rendered.grad, gradient)
+def bounded(relative):
+    return 0.1 * (1 - torch.exp(-relative.abs() / 0.1))
 
 
-def test_relative_differences_need_no_unit(at_points, rendered, points):
+@pytest.mark.parametrize("unit", [1.0, 1e-3, 50.0])
+def test_at_points_expected_depth_is_sampled_as_by_torch_with_pixel_centres_at_one_half(
+    at_points, rendered, points, unit
+):
     pixels, depth = points
-    depth[3] = 0.0  # no point of a surface
-    kept = torch.arange(len(depth)) != 3
-    values = [at_points(unit * rendered, pixels, unit * depth, relative=True).item() for unit in (1.0, 1e-3, 50.0)]
-    pairs = zip(pixels[kept], depth[kept], strict=True)
-    each = [at_points(rendered / z, [pixel.tolist()], [1.0]).item() for pixel, z in pairs]
-    assert values == pytest.approx([sum(each) / len(each)] * 3, rel=1e-6)
+    grid = (2 * pixels / torch.tensor([WIDTH, HEIGHT]) - 1)[None, None]
+    alpha = 0.2 + 0.8 * torch.rand(HEIGHT, WIDTH)
+    expected_depth = (rendered / alpha)[None, None]
+    sampled = grid_sample(expected_depth, grid, padding_mode="border", align_corners=False)[0, 0, 0]
+    expected = bounded(sampled / depth - 1)[1:].mean()
+    measured = unit * depth
+    measured[0] = 0.0  # no point of a surface
+    term = at_points(unit * rendered, pixels, measured, alpha)
+    assert term.item() == pytest.approx(expected.item(), rel=1e-6)
+    gradients = [torch.autograd.grad(each, rendered, retain_graph=True)[0] for each in (term, expected)]
+    torch.testing.assert_close(*gradients)
 
 
 @pytest.mark.parametrize("size", [(HEIGHT, WIDTH), (1, 1), (1, 6), (5, 1)])
@@ -426,7 +394,7 @@ def test_edges_of_the_image_take_the_outermost_pixels(at_points, size, place):
     rendered = torch.arange(1.0, 1.0 + size[0] * size[1]).reshape(size)
     pixel = (place[0] * size[1], place[1] * size[0])
     row, column = (0 if share < 0.5 else -1 for share in place[::-1])
-    assert at_points(rendered, [pixel], [0.0]).item() == pytest.approx(rendered[row, column].item())
+    assert at_points(rendered, [pixel], [rendered[row, column].item()]).item() == pytest.approx(0.0, abs=1e-6)
 
 
 @pytest.mark.parametrize("outside", [(-0.1, 3.0), (4.0, 7.1), (torch.nan, 2.0)])
@@ -437,7 +405,7 @@ def test_points_outside_do_not_count(at_points, rendered, outside):
 
 @pytest.mark.parametrize("spoilt", ["alpha", "mask", "nan"])
 def test_a_point_counts_only_where_all_its_pixels_show_something(at_points, rendered, spoilt):
-    pixels, depth = [[2.0, 2.0], [6.5, 4.5], [6.5, 5.0]], [0.0, 0.0, 0.0]
+    pixels, depth = [[2.0, 2.0], [6.5, 4.5], [6.5, 5.0]], [25.0, 25.0, 25.0]
     alpha, mask = torch.ones(HEIGHT, WIDTH), torch.ones(HEIGHT, WIDTH, dtype=torch.bool)
     values = rendered.detach().clone()
     # One of the four pixels around the first point; and a neighbour of weight 0 of the second.
@@ -448,37 +416,18 @@ def test_a_point_counts_only_where_all_its_pixels_show_something(at_points, rend
     values.requires_grad_()
     term = at_points(values, pixels, depth, alpha, mask)
     term.backward()
-    assert term.item() == pytest.approx(values[4, 6].item())
+    assert term.item() == pytest.approx(bounded(values[4, 6] / 25 - 1).item())
     assert values.grad.nonzero().tolist() == [[4, 6]]
 
 
 def test_nothing_to_compare_is_zero_and_keeps_the_graph(at_points, rendered):
     frame = make_frame(torch.zeros(HEIGHT, WIDTH, 3, dtype=torch.uint8))
-    output = make_output(torch.zeros(HEIGHT, WIDTH, 3), depth_expected=rendered)
+    output = make_output(torch.zeros(HEIGHT, WIDTH, 3), depth_accumulated=rendered)
     empty = SparseDepth(torch.zeros(0, 2), torch.zeros(0))
-    terms = [make_sparse()(output, frame), make_sparse()(output, replace(frame, sparse_depth=empty))]
+    terms = [scene_depth(output, frame), scene_depth(output, replace(frame, sparse_depth=empty))]
     terms.append(at_points(rendered, [[3.0, 3.0]], [5.0], alpha=torch.zeros(HEIGHT, WIDTH)))
     for term in terms:
         assert term.item() == 0.0
         assert term.dtype == rendered.dtype
         (gradient,) = torch.autograd.grad(term, rendered)
         assert not gradient.any()
-
-
-def test_a_bounded_point_pulls_less_the_farther_it_is(at_points, rendered):
-    """x becomes b (1 - exp(-x / b)): its slope is exp(-x / b), whatever its value."""
-    value = rendered[2, 3].item()
-    for share in (0.01, 0.5, 3.0, 1e4):
-        depth = value / (1.0 + share)
-        term = at_points(rendered, [[3.5, 2.5]], [depth], relative=True, bound=0.1)
-        assert term.item() == pytest.approx(0.1 * (1 - math.exp(-share / 0.1)), rel=1e-5)
-        (gradient,) = torch.autograd.grad(term, rendered)
-        assert gradient[2, 3].item() == pytest.approx(math.exp(-share / 0.1) / depth, rel=1e-5, abs=1e-12)
-
-
-def test_inverse_depth_is_inverted_and_emptiness_left_out(at_points):
-    inverse = torch.tensor([[0.05, 0.0], [0.04, 0.02]], requires_grad=True)
-    term = at_points(inverse, [[0.5, 0.5], [1.5, 0.5]], [18.0, 18.0], kind="inverse_depth_accumulated")
-    term.backward()
-    assert term.item() == pytest.approx(2.0)
-    assert inverse.grad.tolist() == [[pytest.approx(-400.0), 0.0], [0.0, 0.0]]

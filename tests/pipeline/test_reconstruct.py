@@ -158,7 +158,6 @@ def test_a_tube_is_reconstructed_from_its_frames(tmp_path, monkeypatch):
     settings = {
         "sfm.camera.model": "PINHOLE",
         "sfm.camera.params": INTRINSICS,
-        "method": "coliags-in-vivo",
         "steps": 20,
     }
     record = cp.reconstruct(folder, tmp_path / "out", settings=settings)

@@ -138,7 +138,7 @@ def test_a_prior_by_another_and_what_is_printed(wall, tmp_path, capsys):
     summary, written, command = capsys.readouterr().out.splitlines()
     assert re.fullmatch(r"6 frames, \d+ % of the pixels with a confidence of 0.5 or more; \d+ points", summary)
     assert written == f"written: {out}"
-    assert command == f"next:    coliags train coliags-in-vivo --data {out} --set datamanager.split=endogslam"
+    assert command == f"next:    coliags train coliags-plus --data {out} --set datamanager.split=endogslam"
     frames = frames_of(out)
     error = np.stack([np.abs(frame.depth.numpy() / wall_depth(frame.camera) - 1.0) for frame in frames])
     unknown = np.stack([confidence_of(out, frame.name) for frame in frames]) == 0.0
