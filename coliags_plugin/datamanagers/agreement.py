@@ -5,7 +5,7 @@ point z_ij of ``z <- z z_j(u_j(z)) / z_j'(z)``, u_j and z_j' the pixel and the z
 Over pairs of frames that are l apart, V(l) is the robust variance of log z_ij / z_i. Noise contributes as much at every
 l, what moves contributes with the square of l (docs/methods.md 4.14):
 
-    2 s^2  = min(V(1), max((4 V(1) - V(2)) / 3, V(1) / 4)),   m^2(l) = max(0, V(l) - 2 s^2)
+    2 s^2  = min(V(1), max(0, (4 V(1) - V(2)) / 3)),   m^2(l) = max(0, V(l) - 2 s^2)
     log z  = sum_j w_ij log z_ij / sum_j w_ij,   w_ii = 1 / s^2,   w_ij = 1 / (s^2 + m^2(l)),   within 4 sqrt(2) s
 """
 
@@ -38,8 +38,6 @@ _NEIGHBOURS = (1, 2, 3, 4, 6, 9, 13)
 _SAMPLED, _FEWEST_FRAMES, _FEWEST = 16, 5, 100
 #: Iterations of the fixed point, and the last change of depth up to which it has converged.
 _ITERATIONS, _CONVERGED = 3, 0.004
-#: Passes of averaging.
-_PASSES = 2
 #: Second difference of inverse depth, relative to it, above which there is a step; and the multiple of its median in
 #: the frame, which white noise raises, that it must exceed, too.
 _STEP, _NOISY_BEND = 0.03, 4.0
@@ -56,7 +54,7 @@ class Agreement:
     """Errors of a scene's depth, as its frames tell them."""
 
     noise: float  # relative standard deviation of the given depth
-    remaining_noise: float  # the same after averaging, as far as the errors of frames are independent
+    remaining_noise: float  # the same after the first pass of averaging, as far as errors of frames are independent
     sharpness: float  # median share of a depth step, over three pixels, that lies between its middle two
     deviations: Mapping[int, float]  # relative, between frames that are so many places of the video apart
 
@@ -97,12 +95,15 @@ def agreed_depth(scene: Scene, progress: Progress | None = None) -> tuple[Scene,
     variances = _variances(views)
     if not variances:
         return scene, None
-    noise = remaining = _at_zero(variances)
+    noise = _at_zero(variances)
     agreement = Agreement(noise**0.5, noise**0.5, sharpness, {lag: value**0.5 for lag, value in variances.items()})
     if not (agreement.is_noisy or agreement.is_blurred):
         return scene, agreement
-    for _ in range(_PASSES if agreement.is_noisy else 0):
-        remaining = _average(views, variances, noise, remaining, progress)
+    if agreement.is_noisy:
+        left = _average(views, variances, noise, noise, progress)
+        agreement = replace(agreement, remaining_noise=left**0.5)
+        # Neighbours share errors by now: this pass lessens them further, but by less than it computes.
+        _average(views, variances, noise, left, progress)
     depths = [view.depth for view in views]
     if agreement.is_blurred:
         depths = parallel_map(_sharpened, views, "sharpen depth steps", progress)
@@ -111,7 +112,7 @@ def agreed_depth(scene: Scene, progress: Progress | None = None) -> tuple[Scene,
     if scene.provenance.points.source == DEPTH_POINTS:
         generator = np.random.default_rng(scene.provenance.points.seed)
         points = fuse_depth(train, len(points), generator, progress)
-    return replace(scene, train=train, points=points), replace(agreement, remaining_noise=remaining**0.5)
+    return replace(scene, train=train, points=points), agreement
 
 
 @dataclass
@@ -169,7 +170,8 @@ def _sharpness(frames: Sequence[Frame]) -> float:
             jumps = lines.diff(dim=1).abs()
             before, jump, after = jumps[:, :-2], jumps[:, 1:-1], jumps[:, 2:]
             height = (lines[:, 3:] - lines[:, :-3]).abs()
-            steep = (height > 0.15) & (jump >= before) & (jump >= after)
+            noisy = _NOISY_BEND * float(lines.diff(n=2, dim=1).abs().nanmedian())
+            steep = (height > max(0.15, noisy)) & (jump >= before) & (jump >= after)
             shares.append((jump / height)[steep])
     steps = torch.cat(shares)
     return float(steps.median()) if len(steps) > _FEWEST else 1.0
@@ -224,7 +226,7 @@ def _at_zero(variances: Mapping[int, float]) -> float:
     """s^2: half of what is left of V(l) at l = 0."""
     first = next(iter(variances))
     nearest, twice = variances[first], variances.get(2 * first)
-    at_zero = nearest if twice is None else min(nearest, max((4 * nearest - twice) / 3, nearest / 4))
+    at_zero = nearest if twice is None else min(nearest, max(0.0, (4 * nearest - twice) / 3))
     return at_zero / 2
 
 

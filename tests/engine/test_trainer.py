@@ -353,6 +353,25 @@ def test_each_step_and_term_is_logged_and_where_the_run_came_from(tmp_path):
     assert software().items() <= provenance.items()
 
 
+def test_training_depth_is_what_frames_agree_on_where_the_method_says_so(tmp_path):
+    scene, noise = wall_scene(), 0.03 * torch.randn(7, generator=torch.Generator().manual_seed(2))
+    noisy = [frame.with_maps(depth=frame.depth * by.exp()) for frame, by in zip(scene.train, noise, strict=True)]
+    given = replace(scene, train=noisy)
+    plain = make_trainer(tmp_path / "plain", scene=given)
+    agreed = make_trainer(tmp_path / "agreed", scene=given, overrides=["agreed_depth=true"])
+    assert all(used.depth is frame.depth for used, frame in zip(plain.scene.train, noisy, strict=True))
+    assert "agreement" not in plain.provenance()["scene"]
+
+    def error(frames):
+        logs = [(frame.depth / true.depth).log() for frame, true in zip(frames, scene.train, strict=True)]
+        return float(torch.stack(logs).square().mean().sqrt())
+
+    agreement = agreed.provenance()["scene"]["agreement"]
+    assert agreement["noise"] > 2 * agreement["remaining_noise"] > 0
+    assert agreed.frames is agreed.scene.train and error(agreed.frames) < error(noisy) / 2
+    assert agreed.scene.points is scene.points and agreed.scene.test_sets is scene.test_sets
+
+
 # Memory of a device
 
 
