@@ -22,6 +22,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from coliags_plugin.core.cameras import Camera
+from coliags_plugin.core.depth_maps import Pose, WeightedDepth, depths_by
 from coliags_plugin.core.jobs import Progress
 from coliags_plugin.core.json_files import JsonObject
 from coliags_plugin.core.scene_files import parallel_map
@@ -36,8 +37,6 @@ SHARP = 0.7
 _NEIGHBOURS = (1, 2, 3, 4, 6, 9, 13)
 #: Frames from which the noise is estimated, and fewest frames and differences that tell it.
 _SAMPLED, _FEWEST_FRAMES, _FEWEST = 16, 5, 100
-#: Iterations of the fixed point, and the last change of depth up to which it has converged.
-_ITERATIONS, _CONVERGED = 3, 0.004
 #: Second difference of inverse depth, relative to it, above which there is a step; and the multiple of its median in
 #: the frame, which white noise raises, that it must exceed, too.
 _STEP, _NOISY_BEND = 0.03, 4.0
@@ -85,9 +84,10 @@ def agreed_depth(scene: Scene, progress: Progress | None = None) -> tuple[Scene,
     """The scene with training depth that its frames agree on, and with points fused from it if they came from depth.
 
     Depth that is exact and sharp stays as it is, to the bit. A pixel at a blurred step gets the depth of its side, and
-    is unknown where it is of neither side. None instead of an agreement where too few frames have depth.
+    is unknown where it is of neither side. None instead of an agreement where too few frames have true depth: the
+    errors of estimated depth are shared by its frames.
     """
-    frames = [frame.to("cpu") for frame in scene.train if frame.depth is not None]
+    frames = [frame.to("cpu") for frame in scene.train if frame.true_depth is not None]
     if len(frames) < _FEWEST_FRAMES:
         return scene, None
     sharpness = _sharpness(frames[:: max(1, len(frames) // _SAMPLED)])
@@ -126,6 +126,12 @@ class _View:
     steps: Tensor  # at depth steps, and one pixel around them
     comparable: Tensor  # away from steps, and from unknown depth that blurs into the known
     depth: Tensor  # as averaged so far
+
+    @property
+    def surface(self) -> WeightedDepth:
+        """Depth where it is comparable, NaN elsewhere, to compare others with."""
+        depth = torch.where(self.comparable, self.depth, torch.nan)
+        return WeightedDepth(Pose.of(self.camera), depth.numpy(), np.ones(depth.shape, np.float32))
 
 
 def _view(frame: Frame, is_blurred: bool) -> _View:
@@ -177,28 +183,12 @@ def _sharpness(frames: Sequence[Frame]) -> float:
     return float(steps.median()) if len(steps) > _FEWEST else 1.0
 
 
-def _meeting(view: _View, other: _View, surface: Float[Tensor, "H W"]) -> Float[Tensor, "H W"]:
-    """Depths at which the rays of a view meet the surface of another; NaN where they do not, or it is not known."""
-    camera, target = (each.to("cpu", torch.float64) for each in (view.camera, other.camera))
-    axes = target.camera_to_world[:3, :3]
-    directions, shift = (camera.rays() @ axes).float(), ((camera.center - target.center) @ axes).float()
-    height, width = surface.shape
-    depth, ratio = view.depth, torch.full_like(view.depth, torch.nan)
-    for _ in range(_ITERATIONS):
-        right, down, ahead = (directions * depth[..., None] + shift).unbind(-1)
-        ahead = torch.where(ahead > 0, ahead, torch.nan)
-        u = (target.fx * right / ahead + target.cx - 0.5) * (2 / (width - 1)) - 1
-        v = (target.fy * down / ahead + target.cy - 0.5) * (2 / (height - 1)) - 1
-        grid = torch.stack([u, v], dim=-1)[None]
-        seen = functional.grid_sample(surface[None, None], grid, "bilinear", "zeros", align_corners=True)[0, 0]
-        ratio = torch.where((u.abs() <= 1) & (v.abs() <= 1), seen / ahead, torch.nan)
-        depth = depth * ratio
-    return torch.where((ratio - 1).abs() < _CONVERGED, depth, torch.nan)
-
-
-def _surface(view: _View) -> Float[Tensor, "H W"]:
-    """Depth where it is comparable, NaN elsewhere."""
-    return torch.where(view.comparable, view.depth, torch.nan)
+def _offsets(view: _View, others: Sequence[_View]) -> list[Float[Tensor, "H W"]]:
+    """Log depth at which the rays of a view meet the surface of each other one, less its own; NaN where unknown."""
+    frame = WeightedDepth(Pose.of(view.camera), view.depth.numpy(), np.ones(view.depth.shape, np.float32))
+    depth, by_others, _ = depths_by([other.surface for other in others], frame)
+    offsets = torch.from_numpy(by_others / depth)[:, : view.depth.numel()].log()
+    return list(offsets.view(-1, *view.depth.shape).unbind(0))
 
 
 def _neighbours(views: Sequence[_View], place: int) -> list[_View]:
@@ -211,8 +201,9 @@ def _variances(views: Sequence[_View]) -> dict[int, float]:
     differences: dict[int, list[Tensor]] = {}
     for place in range(0, len(views), max(1, len(views) // _SAMPLED)):
         view = views[place]
-        for other in _neighbours(views, place):
-            logs = (_meeting(view, other, _surface(other)) / view.depth).log()[view.comparable]
+        others = _neighbours(views, place)
+        for other, offset in zip(others, _offsets(view, others), strict=True):
+            logs = offset[view.comparable]
             differences.setdefault(abs(other.index - view.index), []).append(logs[logs.isfinite()][::7])
     gathered = {lag: torch.cat(parts) for lag, parts in sorted(differences.items())}
     return {lag: _robust_variance(logs) for lag, logs in gathered.items() if len(logs) > _FEWEST}
@@ -234,7 +225,6 @@ def _average(
     views: Sequence[_View], variances: Mapping[int, float], noise: float, left: float, progress: Progress | None
 ) -> float:
     """Average the views' depths, whose errors have a variance of ``left``, over their neighbours; the variance then."""
-    surfaces = {view.index: _surface(view) for view in views}
 
     def moved(lag: int) -> float:
         near = min(variances, key=lambda other: abs(other - lag))
@@ -244,8 +234,8 @@ def _average(
         view = views[place]
         logs = view.depth.log()
         total, weights = torch.zeros_like(logs), torch.full_like(logs, 1 / left)
-        for other in _neighbours(views, place):
-            offset = _meeting(view, other, surfaces[other.index]).log() - logs
+        others = _neighbours(views, place)
+        for other, offset in zip(others, _offsets(view, others), strict=True):
             weight = 1 / (left + moved(abs(other.index - view.index)))
             agrees = view.comparable & (offset.abs() < 4 * math.sqrt(2 * left))
             total += torch.where(agrees, weight * offset, 0.0)

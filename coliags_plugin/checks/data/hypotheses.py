@@ -11,12 +11,12 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from coliags_plugin.core.cameras import Camera
+from coliags_plugin.core.depth_maps import Pose
 from coliags_plugin.core.jobs import Progress, with_progress
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.core.tensors import bilinear
 from coliags_plugin.geometry.poses.trajectory import w_first
 from coliags_plugin.reconstruction.structure.features import (
-    Pose,
     feature_extractor,
     have_positive_depths,
     mutual_matches,

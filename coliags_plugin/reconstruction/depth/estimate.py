@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Float
 
 from coliags_plugin.core.arrays import read_arrays
+from coliags_plugin.core.depth_maps import Map, Pose, WeightedDepth
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_write, make_folder, write_arrays, write_json
 from coliags_plugin.core.images import sizes_text
@@ -39,10 +40,8 @@ from coliags_plugin.reconstruction.depth.sweeping import (
     SWEEPS,
     DepthEstimationSettings,
     Guide,
-    Map,
     Sweep,
     Swept,
-    WeightedDepth,
     depth_confidence,
     disagreement,
     fuse_frame,
@@ -51,7 +50,6 @@ from coliags_plugin.reconstruction.depth.sweeping import (
     sweep_frame,
     sweep_weight,
 )
-from coliags_plugin.reconstruction.structure.features import Pose
 
 log = logging.getLogger(__name__)
 

@@ -13,15 +13,15 @@ import numpy as np
 from jaxtyping import Float, Float32, UInt8
 from scipy.spatial import cKDTree
 
+from coliags_plugin.core.depth_maps import Map, Pose
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.jobs import Progress, with_progress
 from coliags_plugin.core.scene_files import files_in, first_few
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.datamanagers.file_formats import read_exr_channel, scaled_depth
-from coliags_plugin.reconstruction.depth.sweeping import MAX_TURN, Map, Mask
+from coliags_plugin.reconstruction.depth.sweeping import MAX_TURN, Mask
 from coliags_plugin.reconstruction.structure.features import (
     Features,
-    Pose,
     feature_extractor,
     have_positive_depths,
     image_and_mask,

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Float32, Int, UInt8
 
+from coliags_plugin.core.depth_maps import Map, Pose
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_folder
 from coliags_plugin.core.jobs import Progress, with_progress
@@ -20,8 +21,8 @@ from coliags_plugin.datamanagers.nerfstudio import EstimatedSceneWriter
 from coliags_plugin.datamanagers.shots import PAPER_SIZE, fitted
 from coliags_plugin.reconstruction.depth.estimate import Estimation, check_video, work_folder
 from coliags_plugin.reconstruction.depth.priors import DepthRange, FilePrior, LightPrior, find_range
-from coliags_plugin.reconstruction.depth.sweeping import DepthEstimationSettings, Map
-from coliags_plugin.reconstruction.structure.features import Pose, image_and_mask
+from coliags_plugin.reconstruction.depth.sweeping import DepthEstimationSettings
+from coliags_plugin.reconstruction.structure.features import image_and_mask
 
 log = logging.getLogger(__name__)
 

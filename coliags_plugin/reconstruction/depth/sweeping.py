@@ -11,9 +11,10 @@ import numpy as np
 from jaxtyping import Bool, Float32
 from pydantic import Field
 
+from coliags_plugin.core.depth_maps import Map, Pose, WeightedDepth, depths_by
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.core.settings import Settings
-from coliags_plugin.reconstruction.structure.features import Pose, image_and_mask, usable
+from coliags_plugin.reconstruction.structure.features import image_and_mask, usable
 from coliags_plugin.reconstruction.structure.sfm_settings import FeatureSettings
 
 
@@ -50,7 +51,6 @@ class DepthEstimationSettings(Settings):
 
 
 #: A value, and whether one counts, for every pixel of a frame.
-Map = Float32[np.ndarray, "H W"]
 Mask = Bool[np.ndarray, "H W"]
 
 #: Added to intensity before the logarithm, which would amplify the noise of dark pixels.
@@ -144,31 +144,17 @@ def sweep_frame(
     return Swept((base * np.exp(position)).astype(np.float32), fit, margin)
 
 
-#: Iterations until a ray has met a neighbour's surface, and the relative change at which it has.
-_ITERATIONS, _CONVERGED = 12, 1e-3
-
-
-@dataclass(frozen=True, eq=False)
-class WeightedDepth:
-    """Depth of a frame with weights."""
-
-    pose: Pose  # camera of its size
-    depth: Map  # z-depth; NaN where unknown
-    weight: Map  # 0 where it does not count
-
-
 def fuse_frame(frame: WeightedDepth, neighbours: Sequence[WeightedDepth], agreement: float) -> tuple[Map, Map, Map]:
     """Weighted median of the depths that a frame and its neighbours give to each pixel, within the densest group.
 
-    A neighbour's depth of a pixel is where the pixel's ray meets the neighbour's surface, found by fixed-point
-    iteration from the frame's own depth. Depths agree up to a relative difference of ``agreement``.
+    Depths agree up to a relative difference of ``agreement``.
 
     Returns the z-depth, the frame's own where no other counts; the weight of the frames that agree with it; and the
     mean relative deviation within the group.
     """
     from coliags_plugin.reconstruction.depth.numba_kernels.kernels import vote
 
-    depth, candidates, trusts = _depths_by(neighbours, frame)
+    depth, candidates, trusts = depths_by(neighbours, frame)
     weight = np.pad(frame.weight.ravel(), (0, len(depth) - frame.weight.size))
     written = np.empty((3, len(depth)), np.float32)
     vote(depth, weight, candidates, trusts, np.float32(agreement), *written)
@@ -182,27 +168,9 @@ _HIDDEN = 0.1
 
 def disagreement(frame: WeightedDepth, neighbours: Sequence[WeightedDepth]) -> float:
     """Mean difference of a frame's log depth from its neighbours', each up to 0.1; infinite if none sees its pixels."""
-    depth, candidates, _ = _depths_by(neighbours, frame)
+    depth, candidates, _ = depths_by(neighbours, frame)
     ratio = (candidates / depth)[np.isfinite(candidates)]
     return float(np.minimum(np.abs(np.log(ratio)), _HIDDEN).mean()) if len(ratio) else math.inf
-
-
-def _depths_by(
-    neighbours: Sequence[WeightedDepth], frame: WeightedDepth
-) -> tuple[Float32[np.ndarray, "P"], Float32[np.ndarray, "N P"], Float32[np.ndarray, "N P"]]:
-    """z-depth of a frame's pixels and zeros up to a multiple of sixteen; the same by its neighbours, with weights."""
-    from coliags_plugin.core.numba_kernels.lanes import WIDTH
-    from coliags_plugin.reconstruction.depth.numba_kernels.kernels import reproject
-
-    width, size = frame.depth.shape[1], frame.depth.size
-    depth = np.pad(frame.depth.ravel(), (0, -size % WIDTH))
-    candidates = np.empty((len(neighbours), len(depth)), np.float32)
-    trusts = np.empty_like(candidates)
-    for index, other in enumerate(neighbours):
-        there, back = frame.pose.homography(other.pose), frame.pose.depth_from(other.pose)
-        outputs = candidates[index], trusts[index]
-        reproject(depth, width, other.depth, other.weight, *there, *back, _ITERATIONS, np.float32(_CONVERGED), *outputs)
-    return depth, candidates, trusts
 
 
 #: Of the regression: constant, log support, log spread, near side of an edge, log depth across a window.

@@ -15,7 +15,6 @@ from scipy.spatial import cKDTree
 from coliags_plugin.core.arrays import dilated
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.images import highlights
-from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.core.jobs import Progress, with_progress
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.geometry.lenses.models import PinholeLens
@@ -140,49 +139,6 @@ def mutual_matches(first: Features, second: Features, max_ratio: float = 0.8) ->
     distance, second_best = (np.sqrt(np.maximum(2.0 - 2.0 * product, 0.0)) for product in products)
     is_match = (distance < _MAX_DISTANCE) & (distance < max_ratio * second_best)
     return np.stack([rows[is_match], partners[is_match]], axis=1).astype(np.uint32)
-
-
-@dataclass(frozen=True, eq=False)
-class Pose:
-    """Intrinsics and rigid pose of a view in float64."""
-
-    intrinsics: Intrinsics
-    camera_to_world: Float[np.ndarray, "4 4"]
-
-    @classmethod
-    def of(cls, camera: Camera, size: tuple[int, int] | None = None) -> Pose:
-        """Pose of a camera, with intrinsics for an image of another width and height if they are given."""
-        intrinsics = camera.intrinsics if size is None else camera.intrinsics.resized(*size)
-        return cls(intrinsics, camera.camera_to_world.cpu().double().numpy())
-
-    @property
-    def matrix(self) -> Float[np.ndarray, "3 3"]:
-        """K for pixel centres at integers + 0.5."""
-        k = self.intrinsics
-        return np.array([[k.fx, 0.0, k.cx], [0.0, k.fy, k.cy], [0.0, 0.0, 1.0]])
-
-    def rays(self) -> Float[np.ndarray, "H W 3"]:
-        """Directions through the pixel centres in the camera's axes, z = 1."""
-        k = self.intrinsics
-        x = (np.arange(k.width) + 0.5 - k.cx) / k.fx
-        y = (np.arange(k.height) + 0.5 - k.cy) / k.fy
-        return np.stack([*np.meshgrid(x, y), np.ones((k.height, k.width))], axis=-1)
-
-    def to(self, other: Pose) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]:
-        """Rotation and translation from this camera's axes to another's."""
-        turn = other.camera_to_world[:3, :3].T
-        return turn @ self.camera_to_world[:3, :3], turn @ (self.camera_to_world[:3, 3] - other.camera_to_world[:3, 3])
-
-    def homography(self, other: Pose) -> tuple[Float32[np.ndarray, "3 3"], Float32[np.ndarray, "3"]]:
-        """A and b that map pixel p at z-depth z to the homogeneous pixel A (p, 1) z + b of another view."""
-        rotation, translation = self.to(other)
-        turn = other.matrix @ rotation @ np.linalg.inv(self.matrix)
-        return turn.astype(np.float32), (other.matrix @ translation).astype(np.float32)
-
-    def depth_from(self, other: Pose) -> tuple[Float32[np.ndarray, "3"], np.float32]:
-        """Vector a and number b that map pixel p of another view at z-depth z to z-depth a . (p, 1) z + b here."""
-        rotation, translation = other.to(self)
-        return (rotation[2] @ np.linalg.inv(other.matrix)).astype(np.float32), np.float32(translation[2])
 
 
 def rays(pixels: Float[np.ndarray, "N 2"], camera: Camera) -> Float[np.ndarray, "N 3"]:

@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from coliags_plugin.core.cameras import Camera
+from coliags_plugin.core.depth_maps import Pose, WeightedDepth
 from coliags_plugin.core.images import write_image
 from coliags_plugin.core.scenes import Frame, SparseDepth
 from coliags_plugin.reconstruction.depth.estimate import choose_neighbours
@@ -27,7 +28,6 @@ from coliags_plugin.reconstruction.depth.scene import VoxelPoints
 from coliags_plugin.reconstruction.depth.sweeping import (
     SWEEPS,
     Sweep,
-    WeightedDepth,
     depth_confidence,
     disagreement,
     fuse_frame,
@@ -35,7 +35,6 @@ from coliags_plugin.reconstruction.depth.sweeping import (
     ratios,
     sweep_frame,
 )
-from coliags_plugin.reconstruction.structure.features import Pose
 from coliags_plugin.reconstruction.structure.sfm_settings import FeatureSettings
 from tests.commands import refuses
 from tests.reconstruction.depth.walls import sideways, wall_depth, wall_frames
