@@ -1,7 +1,6 @@
 """Depth that the frames of a video agree on: noise averaged over frames, and the blur at depth steps undone.
 
-A pixel of frame i has depth z_i. Frame j shows the same surface; where the pixel's ray meets that surface is the fixed
-point z_ij of ``z <- z z_j(u_j(z)) / z_j'(z)``, u_j and z_j' the pixel and the z-depth in frame j of the point at z.
+A pixel of frame i has depth z_i. Frame j shows the same surface; the pixel's ray meets it at depth z_ij.
 Over pairs of frames that are l apart, V(l) is the robust variance of log z_ij / z_i. Noise contributes as much at every
 l, what moves contributes with the square of l (docs/methods.md 4.14):
 
