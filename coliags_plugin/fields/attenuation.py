@@ -167,8 +167,8 @@ class AttenuatedAppearanceHead(AppearanceHead[AttenuatedAppearanceSettings]):
         self, positions: Float[Tensor, "N 3"], opacities: Float[Tensor, "N"], sizes: Float[Tensor, "N"], camera: Camera
     ) -> Float[Tensor, "N 3"] | None:
         """One less the learned share of each colour times the share of the lamps' light that is missing."""
-        lamps = [lamp for lamp in self.lamps if lamp[3] > 0] if self.settings.shadows else []
-        if not lamps:
+        lamps = self.lamps[self.lamps[:, 3] > 0] if self.settings.shadows else ()
+        if not len(lamps):
             return None
         lit = [lamp[3] * lit_shares(positions, opacities, sizes, camera, lamp[:3]) for lamp in lamps]
         return 1.0 - (1.0 - torch.stack(lit).sum(0))[:, None] * self.shadow.sigmoid()

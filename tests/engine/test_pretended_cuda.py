@@ -23,11 +23,12 @@ from tests.scenes import SMALL, wall_scene, write_wall
 #: What runs on the device in training, without renderers: rivals and modules beyond those of `coliags`.
 METHODS = ("3dgs-depth", "2dgs", "gaussian-pancakes", "pr-endo", "scaffold-gs", "reim-nerf-small", "coliags-plus")
 #: Waits of a step that are not the renderers': for losses and checks, and for the lengths of the lists of elements in
-#: view and of those drawn.
+#: view, of those drawn, and of the lamps that cast shadows.
 WAITS = Counter(
     {
         "tolist engine/trainer.py": 1,
         "tolist fields/triton_kernels/children.py": 1,
+        "a mask as index fields/attenuation.py": 1,
         "nonzero fields/explicit_gaussians.py": 1,
         "nonzero fields/lit_gaussians.py": 1,
     }
@@ -35,7 +36,10 @@ WAITS = Counter(
 #: Methods and options whose steps are counted: every component that steps use is in one of them.
 STEPS = {
     "coliags": (),
-    "coliags-plus": (),
+    "coliags-plus": (
+        *("modules.poses=pose-correction", "modules.warp=image-warp", 'optimizers."warp.displacement"={lr: 0.1}'),
+        *('optimizers."poses.translation"={lr: 0.03}', 'optimizers."poses.rotation"={lr: 0.001}'),
+    ),
     "2dgs": (),
     "3dgs-depth": (),
     "gaussian-pancakes": (),
