@@ -61,6 +61,38 @@ def wall_scene(frames: int = 9, width: int = 32, height: int = 24, depth: bool =
     return Scene("wall", train, {"test": test}, PointCloud(points), Provenance(fingerprint=f"wall-{frames}-{depth}"))
 
 
+#: Depth and half sizes of the plate before the wall, mm.
+PLATE, HALF_PLATE = 9.0, torch.tensor([2.0, 1.6], dtype=torch.float64)
+
+
+def hidden_by_plate(points: torch.Tensor, source: torch.Tensor) -> torch.Tensor:
+    """Whether the plate is between points and a source in front of it."""
+    crossing = source + (points - source) * ((PLATE - source[2]) / (points[..., 2:] - source[2]))
+    return (points[..., 2] > PLATE) & (crossing[..., :2].abs() < HALF_PLATE).all(-1)
+
+
+def plate_scene(lamp: Sequence[float], missing: float, frames: int = 12, width: int = 64, height: int = 48) -> Scene:
+    """The wall z = 20 mm behind a plate, lit as :func:`wall_scene`; where the plate hides a lamp, a share is missing.
+
+    The lamp's position is in camera axes.
+    """
+    plate_frames = []
+    for index in range(frames):
+        x, y, z = 2.5 * math.sin(0.7 * index), 2.0 * math.cos(0.9 * index), 1.5 * math.sin(index)
+        camera = camera_at(x, y, z, width, height)
+        center, rays = camera.center, camera.rays()
+        on_plate, on_wall = (center + (depth - z) * rays for depth in (PLATE, 20.0))
+        points = torch.where(hidden_by_plate(on_wall, center)[..., None], on_plate, on_wall)
+        light = (18.0 / (points - center).norm(dim=-1)) ** (2 / 2.2)
+        light *= 1.0 - missing * hidden_by_plate(points, center + torch.tensor(lamp, dtype=torch.float64))
+        image = (0.5 * wall_color(points) * light[..., None] * 255).round().to(torch.uint8)
+        plate_frames.append(Frame.of(f"{index:04d}", index, image, camera, (points[..., 2] - z).float()))
+    x, y = torch.meshgrid(torch.arange(-12.0, 12.1, 0.5), torch.arange(-10.0, 10.1, 0.5), indexing="ij")
+    wall = torch.stack([x, y, torch.full_like(x, 20.0)], dim=-1).reshape(-1, 3)
+    plate = torch.cat([0.16 * wall[::2, :2], torch.full((len(wall[::2]), 1), PLATE)], dim=1)
+    return Scene("plate", plate_frames, {}, PointCloud(torch.cat([wall, plate])), Provenance(fingerprint="plate"))
+
+
 def write_wall(folder: Path, frames: int = 9, width: int = 32, height: int = 24, depth: bool = True) -> Path:
     """:func:`wall_scene` on disk, in C3VD's undistorted layout; without depth, its points stand in a file."""
     scene = wall_scene(frames, width, height, depth)

@@ -36,10 +36,10 @@ def lit_shares(
 ) -> Float[Tensor, "N"]:
     """Share of a lamp's light that reaches each of the places that a camera sees, from 0 to 1, without gradient.
 
-    The map has the camera's image seen from the lamp. A place covers the cells, a pixel wide, whose centres are within
-    its size along both axes, and the cell that it is in. The surface of a cell is the mean depth, weighted by opacity,
-    of the places within :data:`LAYER` of the nearest; a place is lit where it is not behind the surfaces of the four
-    cells around it, interpolated bilinearly. Where the map knows of no surface, everything is lit.
+    The map is the camera's image, seen from the lamp. A place covers the cells, a pixel wide, whose centres are within
+    its size along both axes, or else the cell that it is in. The surface of a cell is the mean depth, weighted by
+    opacity, of the places within :data:`LAYER` of the nearest; a place is lit where it is not behind the surfaces of
+    the four cells around it, interpolated bilinearly. Outside the map, and where it has no surface, everything is lit.
 
     Args:
         positions: World frame, scene units. [N, 3]
@@ -50,65 +50,69 @@ def lit_shares(
     """
     rotation = camera.camera_to_world[:3, :3].to(positions)
     seen = (positions - camera.center.to(positions)) @ rotation - lamp.to(positions)
-    if fit_kernels(positions):
-        from coliags_plugin.core.numba_kernels.shadows import draw_and_compare
-        from coliags_plugin.core.numba_kernels.threads import Crew
+    if not fit_kernels(seen):
+        return _lit_shares(seen, opacities, sizes, camera)
+    from coliags_plugin.core.numba_kernels.shadows import draw_and_compare
+    from coliags_plugin.core.numba_kernels.threads import Crew
 
-        view = np.array([camera.fx, camera.fy, camera.cx, camera.cy, OPAQUE, LAYER, *SHADOW, REACH], np.float32)
-        shares = torch.empty(len(positions))
-        nearest = np.empty((camera.height + 2 * BORDER, camera.width + 2 * BORDER), np.float32)
-        Crew().run(draw_and_compare, *tables(seen, opacities, sizes), view, BORDER, nearest, *tables(shares))
-        return shares
-    return _lit_shares(seen, opacities, sizes, camera)
+    view = np.array([camera.fx, camera.fy, camera.cx, camera.cy, OPAQUE, LAYER, *SHADOW, REACH], np.float32)
+    surface = np.empty((camera.height + 2 * BORDER, camera.width + 2 * BORDER), np.float32)
+    shares = torch.empty_like(sizes)
+    Crew().run(draw_and_compare, *tables(seen, opacities, sizes), view, BORDER, surface, *tables(shares))
+    return shares
 
 
 def _lit_shares(
     seen: Float[Tensor, "N 3"], opacities: Float[Tensor, "N"], sizes: Float[Tensor, "N"], camera: Camera
 ) -> Float[Tensor, "N"]:
-    """The same in PyTorch, of places in the axes of a camera at the lamp."""
+    """Definition of the shares, of places in the axes of a camera at the lamp."""
     rows, columns = camera.height + 2 * BORDER, camera.width + 2 * BORDER
     depth = seen[:, 2]
     ahead = depth > 0
     safe = torch.where(ahead, depth, 1.0)
+    row = camera.fy * seen[:, 1] / safe + (camera.cy + BORDER - 0.5)  # cell centres are at integers
     column = camera.fx * seen[:, 0] / safe + (camera.cx + BORDER - 0.5)
-    row = camera.fy * seen[:, 1] / safe + (camera.cy + BORDER - 0.5)
-    # Cells of every footprint, one after the other: from the first row and column, so many of each.
+
+    # What casts shadows covers the cells from top to bottom and left to right, listed one footprint after the other.
     reach = (camera.fx * sizes / safe).clamp_max(REACH)
-    ranges = []
-    for centre, cells in ((row, rows), (column, columns)):
-        first, last = (centre - reach).ceil(), (centre + reach).floor()
-        its_own = centre.round()
-        first, last = (torch.where(last < first, its_own, end) for end in (first, last))
-        ranges.append((first.clamp_min(0), last.clamp_max(cells - 1)))
-    (top, bottom), (left, right) = ranges
-    casts = ahead & (opacities > OPAQUE) & (bottom >= top) & (right >= left)
-    casters = casts.nonzero().squeeze(1)
-    wide = (right - left + 1)[casters].long()
-    counts = (bottom - top + 1)[casters].long() * wide
-    drawn = torch.arange(len(casters), device=seen.device).repeat_interleave(counts)
-    place = torch.arange(len(drawn), device=seen.device) - (counts.cumsum(0) - counts)[drawn]
-    each = casters[drawn]
-    cell = (top[each].long() + place // wide[drawn]) * columns + left[each].long() + place % wide[drawn]
-    nearest = torch.full((rows * columns,), torch.inf).to(seen).scatter_reduce(0, cell, depth[each], "amin")
-    weights = torch.where(depth[each] < LAYER * nearest[cell], opacities[each], 0.0)
-    total = torch.zeros_like(nearest).index_add_(0, cell, weights)
-    weighted = torch.zeros_like(nearest).index_add_(0, cell, weights * depth[each])
+    (top, bottom), (left, right) = _range(row, reach, rows), _range(column, reach, columns)
+    casters = (ahead & (opacities > OPAQUE) & (bottom >= top) & (right >= left)).nonzero().squeeze(1)
+    height, width = (bottom - top + 1)[casters].long(), (right - left + 1)[casters].long()
+    counts = height * width
+    firsts, widths = (values.repeat_interleave(counts) for values in (counts.cumsum(0) - counts, width))
+    caster = casters.repeat_interleave(counts)
+    place = torch.arange(len(caster), device=seen.device) - firsts
+    cell = (top[caster].long() + place // widths) * columns + left[caster].long() + place % widths
+
+    drawn = depth[caster]
+    nearest = torch.full((rows * columns,), torch.inf).to(seen).scatter_reduce(0, cell, drawn, "amin")
+    weights = torch.where(drawn < LAYER * nearest[cell], opacities[caster], 0.0)
+    total, weighted = (torch.zeros_like(nearest).index_add(0, cell, values) for values in (weights, weights * drawn))
     surface = torch.where(total > 0, weighted / total, torch.inf)
-    # Bilinear comparison.
-    first_row, first_column = row.floor(), column.floor()
-    inside = ahead & (first_row >= 0) & (first_column >= 0) & (first_row < rows - 1) & (first_column < columns - 1)
-    start = torch.where(inside, first_row * columns + first_column, 0.0).long()
-    down, across = row - first_row, column - first_column
+
+    above, before = row.floor(), column.floor()
+    inside = ahead & (above >= 0) & (before >= 0) & (above < rows - 1) & (before < columns - 1)
+    corner = torch.where(inside, above * columns + before, 0.0).long()
+    down, across = row - above, column - before
     lit = torch.zeros_like(depth)
-    for offset, share in (
+    for step, share in (
         (0, (1 - down) * (1 - across)),
         (1, (1 - down) * across),
         (columns, down * (1 - across)),
         (columns + 1, down * across),
     ):
-        behind = depth / surface[start + offset] - 1.0
+        behind = depth / surface[corner + step] - 1.0
         lit += share * ((SHADOW[1] - behind) / (SHADOW[1] - SHADOW[0])).clamp(0.0, 1.0)
     return torch.where(inside, lit, 1.0)
+
+
+def _range(
+    centre: Float[Tensor, "N"], reach: Float[Tensor, "N"], cells: int
+) -> tuple[Float[Tensor, "N"], Float[Tensor, "N"]]:
+    """First and last of the map's cells within a reach of a centre, or the nearest cell; first > last: none."""
+    first, last = (centre - reach).ceil(), (centre + reach).floor()
+    first, last = (torch.where(last < first, centre.round(), end) for end in (first, last))
+    return first.clamp_min(0), last.clamp_max(cells - 1)
 
 
 #: Distances from the lens, as shares of the scene's, and numbers of the lamps that are tried first; the step in which
@@ -148,49 +152,51 @@ def find_lamps(
     walls = [_Wall(frames[index], sights[:, index].float()) for index in chosen]
     residuals, usable = residuals[:, chosen], usable[:, chosen]
 
-    def darkness(lamp: Float[Tensor, "3"]) -> Float[Tensor, "P F"]:
-        return torch.stack([wall.darkness(lamp) for wall in walls], dim=1)
+    def darkness(place: Float[Tensor, "3"]) -> Float[Tensor, "P F"]:
+        return torch.stack([wall.darkness(place) for wall in walls], dim=1)
 
-    tried = [
+    places = [
         distance * radius * torch.tensor([math.cos(angle), math.sin(angle), 0.0])
         for radius, count in _RINGS
         for angle in (2 * math.pi * index / count for index in range(count))
     ]
-    shadows = [darkness(lamp) for lamp in tried]
+    shadows = [darkness(place) for place in places]
     lit = usable & (torch.stack(shadows).amax(0) == 0)
     albedos = torch.where(lit, residuals, torch.nan).nanmedian(dim=1, keepdim=True).values
     counts = usable & ~lit & (lit.sum(1, keepdim=True) >= _FEWEST)
     if not counts.any():
         return torch.zeros(0, 4)
-    missing = (1.0 - (residuals - albedos)[counts].exp()).clamp(-1.0, 1.0).double().numpy()
+    missing = (1.0 - (residuals - albedos)[counts].exp()).clamp(-1.0, 1.0).double()
 
-    def fitted(shadows: Sequence[Tensor]) -> tuple[np.ndarray, float]:
-        shares, norm = nnls(torch.stack([shadow[counts] for shadow in shadows], dim=1).double().numpy(), missing)
+    def fit(lamps: Sequence[tuple[Tensor, Tensor]]) -> tuple[np.ndarray, float]:
+        """Shares of lamps, given with their shadows, and the squared residuals."""
+        shares, norm = nnls(torch.stack([shadow for _, shadow in lamps], dim=1).numpy(), missing.numpy())
         return shares, norm**2
 
-    total = float(np.square(missing).sum())
-    lamps: list[Tensor] = []
-    cast: list[Tensor] = []
-    shares, error = np.zeros(0), total
+    def error(lamp: tuple[Tensor, Tensor]) -> float:
+        return fit([*lamps, lamp])[1]
+
+    tried = [(place, shadow[counts].double()) for place, shadow in zip(places, shadows, strict=True)]
+    lamps: list[tuple[Tensor, Tensor]] = []
+    least = total = float(missing.square().sum())
     while len(lamps) < MOST_LAMPS:
-        best = min(range(len(tried)), key=lambda index: fitted([*cast, shadows[index]])[1])
-        lamp, shadow, step = tried[best], shadows[best], _STEP
-        new_shares, new_error = fitted([*cast, shadow])
+        lamp, step = min(tried, key=error), _STEP
         while step > _LAST_STEP:
-            moves = [lamp + step * distance * move for move in _MOVES]
-            trials = [(*fitted([*cast, moved]), moved, place) for place in moves for moved in [darkness(place)]]
-            trial = min(trials, key=lambda each: each[1])
-            if trial[1] < new_error:
-                new_shares, new_error, shadow, lamp = trial
+            moves = [(place, darkness(place)[counts].double()) for place in lamp[0] + step * distance * _MOVES]
+            moved = min(moves, key=error)
+            if error(moved) < error(lamp):
+                lamp = moved
             else:
                 step /= 2
-        if error - new_error < _EXPLAINED * total:
+        if least - error(lamp) < _EXPLAINED * total:
             break
-        lamps, cast, shares, error = [*lamps, lamp], [*cast, shadow], new_shares, new_error
+        least = error(lamp)
+        lamps.append(lamp)
     if not lamps:
         return torch.zeros(0, 4)
+    shares, _ = fit(lamps)
     weights = torch.from_numpy(shares / shares.sum()).float()
-    return torch.cat([torch.stack(lamps), weights[:, None]], dim=1)
+    return torch.cat([torch.stack([place for place, _ in lamps]), weights[:, None]], dim=1)
 
 
 class _Wall:

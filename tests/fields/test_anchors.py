@@ -1,4 +1,4 @@
-"""The anchor field: initialisation, decoding, the frustum, its heads, glints of facets, and the law of attenuation."""
+"""The anchor field: initialisation, decoding, frustum, heads, glints of facets, the law of attenuation, and shadows."""
 
 from __future__ import annotations
 
@@ -17,13 +17,15 @@ from coliags_plugin.contracts import SeenAnchors
 from coliags_plugin.core.components import make_component
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.lamps import FlattenedLight, LightOfCamera
+from coliags_plugin.core.photometry import fit_light
 from coliags_plugin.core.scenes import PointCloud
+from coliags_plugin.core.shadows import lit_shares
 from coliags_plugin.fields.attenuation import MAX_OFFSET, AttenuatedAppearanceHead
 from coliags_plugin.fields.heads import MAX_TILT, WIDTHS, GlintAppearanceHead, tangent_components
 from coliags_plugin.fields.mlp import embedded_inputs
 from coliags_plugin.fields.points import neighbour_log_scales, spheres_in_frustum, voxelize
 from tests.fields.made import make_field
-from tests.scenes import camera_at, wall_scene
+from tests.scenes import camera_at, plate_scene, wall_scene
 
 COLIAGS = {"name": "anchors", "geometry_head": "imve", "appearance_head": "imia"}
 SCAFFOLD = {"name": "anchors", "geometry_head": "plain", "appearance_head": "plain"}
@@ -381,3 +383,78 @@ def test_colors_do_not_move_gaussians():
     field = make_anchors(appearance_head={"name": "attenuated", "head": "plain"})
     field.gaussians(camera_at(0.0, 0.0, 0.0)).colors.sum().backward()
     assert not field.offsets.grad.any() and field.appearance_head.exponents.grad.abs().max() > 0
+
+
+# Shadows of lamps beside the lens
+
+
+LAMPS = torch.tensor([[-2.0, 0.3, 0.0, 0.75], [1.5, 1.0, 0.0, 0.25], [0.0, 0.0, 0.0, 0.0]])
+
+
+def make_shadowed(lamps=LAMPS, **options):
+    """Opaque anchors on a plate and the wall behind it, under lamps beside the lens."""
+    appearance = {"name": "attenuated", "head": "plain", **options}
+    geometry = {"name": "plain", "initial_opacity": 0.9}
+    scene = plate_scene((0.0, 0.0, 0.0), 0.0, frames=3)
+    field = make_field("anchors", scene, geometry_head=geometry, appearance_head=appearance, voxel_size=0.3)
+    if options.get("shadows"):
+        field.appearance_head.lamps.copy_(lamps)
+    return field
+
+
+def test_colors_lack_the_share_of_the_lamps_that_are_in_shadow():
+    field, without, camera = make_shadowed(shadows=True), make_shadowed(), camera_at(0.0, 0.0, 0.0, 64, 48)
+    with torch.no_grad():
+        field.appearance_head.shadow.copy_(torch.tensor([0.2, 0.5, 0.8]).logit())
+    drawn, lit = field.gaussians(camera), without.gaussians(camera)
+    sizes = drawn.scales.median(dim=1).values
+    shares = [lit_shares(drawn.means, drawn.opacities, sizes, camera, lamp[:3]) for lamp in LAMPS]
+    dark = 1.0 - 0.75 * shares[0] - 0.25 * shares[1]
+    assert (dark == 0.0).any() and (dark == 0.25).any() and (dark == 0.75).any()
+    expected = lit.colors * (1.0 - dark[:, None] * torch.tensor([0.2, 0.5, 0.8]))
+    torch.testing.assert_close(drawn.colors, expected)
+
+    drawn.colors.sum().backward()
+    slopes = -torch.tensor([0.16, 0.25, 0.16]) * (dark[:, None] * lit.colors).sum(0)  # of sigmoids
+    torch.testing.assert_close(field.appearance_head.shadow.grad, slopes)
+    bias = field.appearance_head.head.color_mlp[2].bias.grad
+    expected.sum().backward()
+    torch.testing.assert_close(bias, without.appearance_head.head.color_mlp[2].bias.grad)
+    assert not field.offsets.grad.any(), "shadows do not move what casts them"
+
+
+def test_without_lamps_colors_are_those_without_shadows_to_the_bit():
+    field, without, camera = make_shadowed(torch.zeros(3, 4), shadows=True), make_shadowed(), camera_at(0.0, 0.0, 0.0)
+    drawn = field.gaussians(camera)
+    sizes = drawn.scales.median(dim=1).values
+    assert field.appearance_head.shadows(drawn.means, drawn.opacities, sizes, camera) is None
+    assert torch.equal(drawn.colors, without.gaussians(camera).colors)
+
+
+def test_a_held_light_casts_no_such_shadows():
+    camera = camera_at(0.0, 0.0, 0.0)
+    for light in (LightOfCamera(camera), FlattenedLight(12.0, 0.9)):
+        colors = [make_shadowed(shadows=shadows).gaussians(camera, light).colors for shadows in (True, False)]
+        assert torch.equal(*colors)
+
+
+def test_lamps_of_shadows_are_in_the_state_and_the_record():
+    field = make_shadowed(shadows=True)
+    restored = type(field).from_state(field.state_dict(), field.settings)
+    assert torch.equal(restored.appearance_head.lamps, LAMPS)
+    camera = camera_at(0.0, 0.0, 0.0)
+    assert torch.equal(restored.gaussians(camera).colors, field.gaussians(camera).colors)
+    assert restored.learned["lamps"] == LAMPS.tolist()
+    assert restored.learned["shadow"] == pytest.approx([1.0 / (1.0 + math.exp(0.5))] * 3)
+    assert field.parameter_groups()["shadow"] == [field.appearance_head.shadow]
+    without = make_shadowed()
+    assert not {"lamps", "shadow"} & {*without.learned, *without.parameter_groups()}
+    assert not any(name.endswith((".lamps", ".shadow")) for name in without.state_dict())
+
+
+def test_lamps_that_points_tell_of_are_kept():
+    scene = plate_scene((-1.6, 0.0, 0.0), 0.4, frames=8, width=96, height=72)
+    appearance = {"name": "attenuated", "head": "plain", "initial": "points", "shadows": True}
+    head = make_field("anchors", scene, geometry_head="plain", appearance_head=appearance).appearance_head
+    assert torch.equal(head.lamps[:1], fit_light(scene).lamps)
+    assert head.lamps[0, 0] < -1.0 and not head.lamps[1:].any()

@@ -27,7 +27,7 @@ def _draw(seen, opacities, sizes, view, border, surface):
     for again in range(2):
         for i in range(len(sizes)):
             depth = seen[3 * i + 2]
-            if depth <= 0.0 or opacities[i] <= view[4]:
+            if not (depth > 0.0 and opacities[i] > view[4]):
                 continue
             row, column = _cell(seen, i, view, border)
             reach = min(view[0] * sizes[i] / depth, view[8])
@@ -53,7 +53,7 @@ def _compare(seen, view, border, surface, shares):
     for i in range(len(shares)):
         shares[i] = 1.0
         depth = seen[3 * i + 2]
-        if depth <= 0.0:
+        if not depth > 0.0:
             continue
         row, column = _cell(seen, i, view, border)
         y, x = np.floor(row), np.floor(column)
@@ -79,8 +79,10 @@ def _cell(seen, i, view, border):
 
 @inline
 def _range(centre, reach, cells):
-    """First and last cell within a reach of a centre, at least its own."""
+    """First and last of the map's cells within a reach of a centre, or the nearest cell; first > last: none."""
     first, last = np.ceil(centre - reach), np.floor(centre + reach)
     if last < first:
         first = last = np.rint(centre)
+    if not (last >= 0.0 and first < cells):  # also where they are not numbers, or too large for integers
+        return 0, -1
     return int(max(first, 0.0)), int(min(last, cells - 1.0))
