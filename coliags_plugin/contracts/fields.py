@@ -268,14 +268,18 @@ class AppearanceHead(Head[SettingsT]):
         return False
 
     def shadows(
-        self, positions: Float[Tensor, "N 3"], opacities: Float[Tensor, "N"], sizes: Float[Tensor, "N"], camera: Camera
+        self,
+        positions: Float[Tensor, "N 3"],
+        opacities: Float[Tensor, "N"],
+        scales: Float[Tensor, "N 3"],
+        camera: Camera,
     ) -> Float[Tensor, "N 3"] | None:
         """Factors of the colours where children keep the light of the camera's lamps from others; None: none do.
 
         Args:
             positions: Of the children, world frame, scene units. [N, 3]
             opacities: [N]
-            sizes: Median standard deviations, scene units. [N]
+            scales: Standard deviations, scene units. [N, 3]
             camera: From which they are seen.
         """
         return None

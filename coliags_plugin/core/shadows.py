@@ -76,13 +76,12 @@ def _lit_shares(
     # What casts shadows covers the cells from top to bottom and left to right, listed one footprint after the other.
     reach = (camera.fx * sizes / safe).clamp_max(REACH)
     (top, bottom), (left, right) = _range(row, reach, rows), _range(column, reach, columns)
-    casters = (ahead & (opacities > OPAQUE) & (bottom >= top) & (right >= left)).nonzero().squeeze(1)
-    height, width = (bottom - top + 1)[casters].long(), (right - left + 1)[casters].long()
-    counts = height * width
-    firsts, widths = (values.repeat_interleave(counts) for values in (counts.cumsum(0) - counts, width))
-    caster = casters.repeat_interleave(counts)
-    place = torch.arange(len(caster), device=seen.device) - firsts
-    cell = (top[caster].long() + place // widths) * columns + left[caster].long() + place % widths
+    casts = ahead & (opacities > OPAQUE) & (bottom >= top) & (right >= left)
+    counts = torch.where(casts, (bottom - top + 1) * (right - left + 1), 0.0).long()
+    caster = torch.arange(len(depth), device=depth.device).repeat_interleave(counts)
+    place = torch.arange(len(caster), device=depth.device) - (counts.cumsum(0) - counts)[caster]
+    width = (right - left + 1)[caster].long()
+    cell = (top[caster].long() + place // width) * columns + left[caster].long() + place % width
 
     drawn = depth[caster]
     nearest = torch.full((rows * columns,), torch.inf).to(seen).scatter_reduce(0, cell, drawn, "amin")

@@ -197,8 +197,7 @@ class AnchorField(GaussianField[AnchorFieldSettings]):
             normals = self.normals.index_select(0, drawn.source_index // self.settings.children)
         lit = self.appearance_head.apply_light(drawn.colors, drawn.means, normals, camera, light)
         if light is None:
-            sizes = drawn.scales.detach().median(dim=1).values
-            shadows = self.appearance_head.shadows(drawn.means, drawn.opacities, sizes, camera)
+            shadows = self.appearance_head.shadows(drawn.means, drawn.opacities, drawn.scales, camera)
             lit = lit if shadows is None else lit * shadows
         return Gaussians(**{**drawn._asdict(), "colors": lit}, visible_sources=visible)
 

@@ -164,12 +164,17 @@ class AttenuatedAppearanceHead(AppearanceHead[AttenuatedAppearanceSettings]):
         return colors * self.law(distances, rays @ camera.optical_axis / distances, incidences)
 
     def shadows(
-        self, positions: Float[Tensor, "N 3"], opacities: Float[Tensor, "N"], sizes: Float[Tensor, "N"], camera: Camera
+        self,
+        positions: Float[Tensor, "N 3"],
+        opacities: Float[Tensor, "N"],
+        scales: Float[Tensor, "N 3"],
+        camera: Camera,
     ) -> Float[Tensor, "N 3"] | None:
         """One less the learned share of each colour times the share of the lamps' light that is missing."""
         lamps = self.lamps[self.lamps[:, 3] > 0] if self.settings.shadows else ()
         if not len(lamps):
             return None
+        sizes = scales.detach().median(dim=1).values
         lit = [lamp[3] * lit_shares(positions, opacities, sizes, camera, lamp[:3]) for lamp in lamps]
         return 1.0 - (1.0 - torch.stack(lit).sum(0))[:, None] * self.shadow.sigmoid()
 

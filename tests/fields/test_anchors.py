@@ -426,8 +426,7 @@ def test_colors_lack_the_share_of_the_lamps_that_are_in_shadow():
 def test_without_lamps_colors_are_those_without_shadows_to_the_bit():
     field, without, camera = make_shadowed(torch.zeros(3, 4), shadows=True), make_shadowed(), camera_at(0.0, 0.0, 0.0)
     drawn = field.gaussians(camera)
-    sizes = drawn.scales.median(dim=1).values
-    assert field.appearance_head.shadows(drawn.means, drawn.opacities, sizes, camera) is None
+    assert field.appearance_head.shadows(drawn.means, drawn.opacities, drawn.scales, camera) is None
     assert torch.equal(drawn.colors, without.gaussians(camera).colors)
 
 
