@@ -108,7 +108,7 @@ def agreed_depth(scene: Scene, progress: Progress | None = None) -> tuple[Scene,
         depths = parallel_map(_sharpened, views, "sharpen depth steps", progress)
     changed = {frame.name: frame.with_maps(depth=depth) for frame, depth in zip(frames, depths, strict=True)}
     train, points = [changed.get(frame.name, frame) for frame in scene.train], scene.points
-    if scene.provenance.points.source == DEPTH_POINTS:
+    if len(points) and scene.provenance.points.source == DEPTH_POINTS:
         generator = np.random.default_rng(scene.provenance.points.seed)
         points = fuse_depth(train, len(points), generator, progress)
     return replace(scene, train=train, points=points), agreement

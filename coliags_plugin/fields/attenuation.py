@@ -97,6 +97,8 @@ class AttenuatedAppearanceHead(AppearanceHead[AttenuatedAppearanceSettings]):
         if len(distances):
             self.reference.copy_(distances.median())
         fitted = fit_light(scene) if self.settings.initial == "points" else None
+        if self.settings.shadows:
+            self.shadow.requires_grad_(fitted is not None and len(fitted.lamps) > 0)
         if fitted is None:
             return
         angles = self.exponents.shape[1] - 1

@@ -399,6 +399,7 @@ def make_shadowed(lamps=LAMPS, **options):
     field = make_field("anchors", scene, geometry_head=geometry, appearance_head=appearance, voxel_size=0.3)
     if options.get("shadows"):
         field.appearance_head.lamps.copy_(lamps)
+        field.appearance_head.shadow.requires_grad_()
     return field
 
 
@@ -456,4 +457,4 @@ def test_lamps_that_points_tell_of_are_kept():
     appearance = {"name": "attenuated", "head": "plain", "initial": "points", "shadows": True}
     head = make_field("anchors", scene, geometry_head="plain", appearance_head=appearance).appearance_head
     assert torch.equal(head.lamps[:1], fit_light(scene).lamps)
-    assert head.lamps[0, 0] < -1.0 and not head.lamps[1:].any()
+    assert head.lamps[0, 0] < -1.0 and not head.lamps[1:].any() and head.shadow.requires_grad
