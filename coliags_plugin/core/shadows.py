@@ -118,8 +118,8 @@ def _range(
 #: they are then moved, and that to which it is halved.
 _RINGS, _STEP, _LAST_STEP = ((0.05, 6), (0.09, 9), (0.13, 12)), 0.03, 0.006
 _MOVES = torch.tensor([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, -1.0, 0.0]])
-#: Most lamps, and the least share of the squared residuals that each must explain.
-MOST_LAMPS, _EXPLAINED = 3, 0.05
+#: Most lamps; least share of the squared residuals that each must explain, and of the colours that it must have.
+MOST_LAMPS, _EXPLAINED, _LEAST = 3, 0.05, 0.05
 #: Approximate number of frames and of pixels of a frame that are looked at; fewest lit observations of a point.
 _FRAMES, _PIXELS, _FEWEST = 28, 20_000, 3
 
@@ -187,9 +187,10 @@ def find_lamps(
                 lamp = moved
             else:
                 step /= 2
-        if least - error(lamp) < _EXPLAINED * total:
+        shares, new_least = fit([*lamps, lamp])
+        if least - new_least < _EXPLAINED * total or shares[-1] < _LEAST:
             break
-        least = error(lamp)
+        least = new_least
         lamps.append(lamp)
     if not lamps:
         return torch.zeros(0, 4)

@@ -453,7 +453,7 @@ def test_lamps_of_shadows_are_in_the_state_and_the_record():
 
 
 def test_lamps_that_points_tell_of_are_kept():
-    scene = plate_scene((-1.6, 0.0, 0.0), 0.4, frames=8, width=96, height=72)
+    scene = plate_scene((-1.6, 0.0, 0.0), 0.4, frames=8)
     appearance = {"name": "attenuated", "head": "plain", "initial": "points", "shadows": True}
     head = make_field("anchors", scene, geometry_head="plain", appearance_head=appearance).appearance_head
     assert torch.equal(head.lamps[:1], fit_light(scene).lamps)
