@@ -55,12 +55,10 @@ class Pose:
         return (rotation[2] @ np.linalg.inv(other.matrix)).astype(np.float32), np.float32(translation[2])
 
 
-#: Iterations until a ray has met a neighbour's surface, and the relative change at which it has.
-_ITERATIONS, _CONVERGED = 12, 1e-3
-
-
 #: Values of an image.
 Map = Float32[np.ndarray, "H W"]
+#: Iterations until a ray has met a neighbour's surface, and the relative change at which it has.
+_ITERATIONS, _CONVERGED = 12, 1e-3
 
 
 @dataclass(frozen=True, eq=False)

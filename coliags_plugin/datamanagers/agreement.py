@@ -22,7 +22,6 @@ from torch.nn import functional
 
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.depth_maps import Pose, WeightedDepth, depths_by
-from coliags_plugin.core.jobs import Progress
 from coliags_plugin.core.json_files import JsonObject
 from coliags_plugin.core.scene_files import parallel_map
 from coliags_plugin.core.scenes import Frame, Scene
@@ -79,18 +78,18 @@ class Agreement:
 
 
 @torch.no_grad()
-def agreed_depth(scene: Scene, progress: Progress | None = None) -> tuple[Scene, Agreement | None]:
+def agreed_depth(scene: Scene) -> tuple[Scene, Agreement | None]:
     """The scene with training depth that its frames agree on, and with points fused from it if they came from depth.
 
     Depth that is exact and sharp stays as it is, to the bit. A pixel at a blurred step gets the depth of its side, and
     is unknown where it is of neither side. None instead of an agreement where too few frames have true depth: the
     errors of estimated depth are shared by its frames.
     """
-    frames = [frame.to("cpu") for frame in scene.train if frame.true_depth is not None]
+    frames = [frame for frame in scene.train if frame.true_depth is not None]
     if len(frames) < _FEWEST_FRAMES:
         return scene, None
     sharpness = _sharpness(frames[:: max(1, len(frames) // _SAMPLED)])
-    views = parallel_map(lambda frame: _view(frame, sharpness < SHARP), frames, "find depth steps", progress)
+    views = parallel_map(lambda frame: _view(frame, sharpness < SHARP), frames, "find depth steps")
     variances = _variances(views)
     if not variances:
         return scene, None
@@ -99,18 +98,18 @@ def agreed_depth(scene: Scene, progress: Progress | None = None) -> tuple[Scene,
     if not (agreement.is_noisy or agreement.is_blurred):
         return scene, agreement
     if agreement.is_noisy:
-        left = _average(views, variances, noise, noise, progress)
+        left = _average(views, variances, noise, noise)
         agreement = replace(agreement, remaining_noise=left**0.5)
         # Neighbours share errors by now: this pass lessens them further, but by less than it computes.
-        _average(views, variances, noise, left, progress)
+        _average(views, variances, noise, left)
     depths = [view.depth for view in views]
     if agreement.is_blurred:
-        depths = parallel_map(_sharpened, views, "sharpen depth steps", progress)
+        depths = parallel_map(_sharpened, views, "sharpen depth steps")
     changed = {frame.name: frame.with_maps(depth=depth) for frame, depth in zip(frames, depths, strict=True)}
     train, points = [changed.get(frame.name, frame) for frame in scene.train], scene.points
     if len(points) and scene.provenance.points.source == DEPTH_POINTS:
         generator = np.random.default_rng(scene.provenance.points.seed)
-        points = fuse_depth(train, len(points), generator, progress)
+        points = fuse_depth(train, len(points), generator)
     return replace(scene, train=train, points=points), agreement
 
 
@@ -220,9 +219,7 @@ def _at_zero(variances: Mapping[int, float]) -> float:
     return at_zero / 2
 
 
-def _average(
-    views: Sequence[_View], variances: Mapping[int, float], noise: float, left: float, progress: Progress | None
-) -> float:
+def _average(views: Sequence[_View], variances: Mapping[int, float], noise: float, left: float) -> float:
     """Average the views' depths, whose errors have a variance of ``left``, over their neighbours; the variance then."""
 
     def moved(lag: int) -> float:
@@ -248,7 +245,7 @@ def _average(
         variance = (1 / weights)[view.comparable]
         return (logs + offset).exp(), float(variance.median()) if len(variance) else left
 
-    results = parallel_map(averaged, range(len(views)), "average depth", progress)
+    results = parallel_map(averaged, range(len(views)), "average depth")
     for view, (depth, _) in zip(views, results, strict=True):
         view.depth = depth
     return float(np.median([variance for _, variance in results]))
