@@ -13,7 +13,7 @@ from torch import Tensor
 
 from coliags_plugin.core.scenes import Frame, Scene
 from coliags_plugin.core.shadows import find_lamps
-from coliags_plugin.core.tensors import wall_normals, zero_outside
+from coliags_plugin.core.tensors import depth_steps, wall_normals, zero_outside
 
 #: Approximate number of patches, and the nearest of them that tell how large one is.
 _PATCHES, _NEIGHBOURS = 600, 8
@@ -76,9 +76,9 @@ def _form_factors(
 _POINTS, _FEWEST = 3000, 3
 #: Encoded colours that count: darker ones are noise, brighter ones are compressed by the camera, or glints.
 _DARKEST, _BRIGHTEST = 0.06, 0.72
-#: Relative difference of depth up to which a point is what the pixel shows; ratio of depths among 3x3 pixels from which
+#: Relative difference of depth up to which a point is what the pixel shows, and of depths among 3x3 pixels above which
 #: their mean mixes colours of two surfaces.
-_SAME_SURFACE, _TWO_SURFACES = 0.02, 1.1
+_SAME_SURFACE, _TWO_SURFACES = 0.02, 0.1
 #: Passes of reweighting by residuals, and the residual at which the weight is a half, in robust standard deviations.
 _PASSES, _HALF_WEIGHT = 5, 2.0
 #: Share of valid pixels among 3x3 above which all are.
@@ -237,8 +237,7 @@ def _seen(
     whole = _mean_of_neighbours(valid[..., None].float())[..., 0] > _ALL
     colors = blurred[row, column].double()
     depth = torch.where(valid, frame.depth.cpu(), math.nan)
-    farthest, nearest = (_largest_of_neighbours(signed).abs() for signed in (depth, -depth))
-    whole &= farthest < _TWO_SURFACES * nearest
+    whole &= ~depth_steps(depth, depth.isfinite(), _TWO_SURFACES)
     stored_depths = depth[row, column]
     has_depth = camera.is_inside(pixels, depths) & stored_depths.isfinite()
     same = has_depth & ((stored_depths - depths).abs() < _SAME_SURFACE * depths)
@@ -250,11 +249,6 @@ def _mean_of_neighbours(image: Float[Tensor, "H W C"]) -> Float[Tensor, "H W C"]
     """Mean over 3x3 pixels, over those that there are at the border."""
     planes = image.permute(2, 0, 1)[None]
     return torch.nn.functional.avg_pool2d(planes, 3, 1, 1, count_include_pad=False)[0].permute(1, 2, 0)
-
-
-def _largest_of_neighbours(values: Float[Tensor, "H W"]) -> Float[Tensor, "H W"]:
-    """Largest of 3x3 pixels that are not NaN."""
-    return torch.nn.functional.max_pool2d(values.nan_to_num(-math.inf)[None], 3, 1, 1)[0]
 
 
 def _lamp(obs: _Observations) -> tuple[Float[Tensor, "6"], Float[Tensor, "F"]]:

@@ -191,3 +191,25 @@ def fit_triton_kernels(*tensors: Tensor) -> bool:
 def tables(*tensors: Tensor) -> list[npt.NDArray[Any]]:
     """The numbers of CPU tensors as flat arrays for numba, which share the memory of contiguous ones."""
     return [np.asarray(tensor.detach().contiguous()).reshape(-1) for tensor in tensors]
+
+
+def depth_steps(
+    depth: Float[Tensor, "H W"], is_known: Bool[Tensor, "H W"], relative_step: float
+) -> Bool[Tensor, "H W"]:
+    """Mask of pixels whose 3x3 window holds a depth step: (max - min) / min of its known depths above a threshold.
+
+    Unknown pixels make no step themselves; two known surfaces on either side of one do. The depth is z-depth.
+    """
+    farthest = _window_max(torch.where(is_known, depth, -torch.inf), 1)
+    nearest = -_window_max(torch.where(is_known, -depth, -torch.inf), 1)
+    return farthest - nearest > relative_step * nearest
+
+
+def dilated(marked: Bool[Tensor, "H W"], reach: int) -> Bool[Tensor, "H W"]:
+    """The mask dilated by ``reach`` rows and columns."""
+    return _window_max(marked.to(torch.float32), reach) > 0
+
+
+def _window_max(values: Float[Tensor, "H W"], reach: int) -> Float[Tensor, "H W"]:
+    """Maximum over the square window around every pixel; pixels outside the image do not count."""
+    return torch.nn.functional.max_pool2d(values[None], 2 * reach + 1, stride=1, padding=reach)[0]

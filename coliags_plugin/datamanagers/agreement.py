@@ -25,6 +25,7 @@ from coliags_plugin.core.depth_maps import Pose, WeightedDepth, depths_by
 from coliags_plugin.core.json_files import JsonObject
 from coliags_plugin.core.scene_files import parallel_map
 from coliags_plugin.core.scenes import Frame, Scene
+from coliags_plugin.core.tensors import dilated
 from coliags_plugin.datamanagers.fusion import DEPTH_POINTS, fuse_depth
 
 #: Relative noise up to which depth is exact and stays as it is.
@@ -142,13 +143,8 @@ def _view(frame: Frame, is_blurred: bool) -> _View:
     return _View(frame.camera, frame.index, depth, known, steps, comparable, depth)
 
 
-def _grown(mask: Bool[Tensor, "H W"], reach: int) -> Bool[Tensor, "H W"]:
-    """The mask and all pixels within a square reach of it."""
-    return functional.max_pool2d(mask[None, None].float(), 2 * reach + 1, 1, reach)[0, 0] > 0
-
-
 def _rim(known: Bool[Tensor, "H W"]) -> Bool[Tensor, "H W"]:
-    return _grown(~known, _RIM)
+    return dilated(~known, _RIM)
 
 
 def _steps(depth: Float[Tensor, "H W"], known: Bool[Tensor, "H W"]) -> Bool[Tensor, "H W"]:
@@ -161,7 +157,7 @@ def _steps(depth: Float[Tensor, "H W"], known: Bool[Tensor, "H W"]) -> Bool[Tens
         bend[[0, -1]], bend[:, [0, -1]] = 0, 0
         bends.append(bend)
     largest = torch.stack(bends).nan_to_num(0.0).amax(0)
-    return _grown(largest > max(_STEP, _NOISY_BEND * float(largest[known].median())), 1)
+    return dilated(largest > max(_STEP, _NOISY_BEND * float(largest[known].median())), 1)
 
 
 def _sharpness(frames: Sequence[Frame]) -> float:
@@ -273,7 +269,7 @@ def _sharpened(view: _View) -> Float[Tensor, "H W"]:
     is_blur = is_step & (far - near > 2 * (near_deviation + far_deviation))
     blurred = torch.zeros_like(view.known)
     blurred[pixels[:, 0], pixels[:, 1]] = is_blur
-    changes = is_step & _grown(blurred, _BLUR)[pixels[:, 0], pixels[:, 1]]
+    changes = is_step & dilated(blurred, _BLUR)[pixels[:, 0], pixels[:, 1]]
     values = torch.where(given < middle, near, far).exp()
     values[(given - middle).abs() < _UNDECIDED * (highest - lowest)] = torch.nan
     row, column = pixels[changes].unbind(1)

@@ -15,6 +15,7 @@ from coliags_plugin.contracts import Comparison, Metric
 from coliags_plugin.core.errors import UnavailableError
 from coliags_plugin.core.settings import Settings
 from coliags_plugin.core.ssim import ssim
+from coliags_plugin.core.tensors import depth_steps, dilated
 
 
 class PSNR(Metric):
@@ -188,25 +189,3 @@ class SparseDepthError(Metric[SparseDepthErrorSettings]):
             raise UnavailableError("nothing was drawn at the points of known depth")
         errors = (rendered.double() - true_depth.double()).abs() / true_depth.double()
         return 100.0 * float(torch.quantile(errors, self.settings.quantile))
-
-
-def depth_steps(
-    depth: Float[Tensor, "H W"], is_known: Bool[Tensor, "H W"], relative_step: float
-) -> Bool[Tensor, "H W"]:
-    """Mask of pixels whose 3x3 window holds a depth step: (max - min) / min of its known depths above a threshold.
-
-    Unknown pixels make no step themselves; two known surfaces on either side of one do. The depth is z-depth.
-    """
-    farthest = _window_max(torch.where(is_known, depth, -torch.inf), 1)
-    nearest = -_window_max(torch.where(is_known, -depth, -torch.inf), 1)
-    return farthest - nearest > relative_step * nearest
-
-
-def dilated(marked: Bool[Tensor, "H W"], reach: int) -> Bool[Tensor, "H W"]:
-    """The mask dilated by ``reach`` rows and columns."""
-    return _window_max(marked.to(torch.float32), reach) > 0
-
-
-def _window_max(values: Float[Tensor, "H W"], reach: int) -> Float[Tensor, "H W"]:
-    """Maximum over the square window around every pixel; pixels outside the image do not count."""
-    return torch.nn.functional.max_pool2d(values[None], 2 * reach + 1, stride=1, padding=reach)[0]
