@@ -300,16 +300,9 @@ def test_presets_fill_what_is_left_open_and_the_record_is_read_back():
     assert phantom_settings({}).model_dump() == PhantomSettings().model_dump()
 
 
-def test_benchmarks_name_seeds_and_an_exact_twin_lacks_nothing_but_the_errors_of_its_scene():
-    for name in ("phantoms-8", "phantoms-12", "phantoms-tuning", "phantoms-tracked"):
-        scenes = {key: scene.phantom for key, scene in load_benchmark(name).scenes.items()}
-        assert name == "phantoms-8" or all(key.endswith(f"-{chosen.seed}") for key, chosen in scenes.items())
-    errors = {"pose_noise": (0.17, 0.09), "depth_noise": 0.03}
-    for key, chosen in scenes.items():
-        if key.startswith("exact"):
-            assert chosen.model_copy(update=errors) == scenes[key.replace("exact", "tracked")]
-        else:
-            assert {name: getattr(chosen, name) for name in errors} == errors
+def test_names_of_phantoms_end_in_their_seeds():
+    for name in ("phantoms-test", "phantoms-tuning"):
+        assert all(key.endswith(f"-{scene.phantom.seed}") for key, scene in load_benchmark(name).scenes.items())
 
 
 # Walls that move, and what covers them: closed forms of the motion, and what lies on disk against the moved wall
