@@ -206,6 +206,8 @@ class Loss(ABC, Configurable[LossSettingsT]):
     Settings: ClassVar[type[Settings]] = LossSettings
     #: Attributes of :class:`Target` that at least one training frame must have (``depth``, ``sparse_depth``).
     needs: ClassVar[frozenset[str]] = frozenset()
+    #: Such attributes of which any will do; it is 0 where a frame has none, and training warns if no frame has any.
+    reads_any: ClassVar[frozenset[str]] = frozenset()
     #: Whether it depends on neighbouring pixels, so that batches of single pixels cannot be used.
     whole_image: ClassVar[bool] = False
     #: Whether it draws the rendered depth to ``Target.depth`` as to the truth, by confidence weighted at most.

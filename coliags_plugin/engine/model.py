@@ -218,8 +218,8 @@ def _check_splats(config: MethodConfig, losses: Mapping[str, Loss]) -> None:
 
 
 def _check_data(scene: Scene, losses: Mapping[str, Loss]) -> None:
-    needed = {name for loss in losses.values() for name in loss.needs}
-    there = {name for name in needed | {"sparse_depth"} if any(getattr(f, name, None) is not None for f in scene.train)}
+    named = {name for loss in losses.values() for name in loss.needs | loss.reads_any}
+    there = {name for name in named | {"sparse_depth"} if any(getattr(f, name, None) is not None for f in scene.train)}
     for key, loss in losses.items():
         for missing in sorted(loss.needs - there):
             instead = ""
@@ -231,6 +231,13 @@ def _check_data(scene: Scene, losses: Mapping[str, Loss]) -> None:
                 f"'{scene.name}' has any",
                 f"frames with {_DATA.get(missing, missing)}, or no such term",
                 f"Remove it with `losses.{key}=null`{instead}",
+            )
+        if loss.reads_any and not loss.reads_any & there:
+            log.warning(
+                "no training frame of scene '%s' has depth, so loss term '%s' does nothing, and floaters are likely; "
+                "`coliags depth estimate` makes a scene with depth",
+                scene.name,
+                key,
             )
 
 

@@ -189,6 +189,7 @@ class SceneDepthLoss(Loss):
     """
 
     whole_image: ClassVar[bool] = True
+    reads_any: ClassVar[frozenset[str]] = frozenset({"depth", "sparse_depth"})
 
     @property
     def wants(self) -> frozenset[str]:

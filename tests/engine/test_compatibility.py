@@ -103,8 +103,10 @@ def test_the_methods_made_for_such_data_are_named(tmp_path, caplog):
     sparse = [replace(frame, sparse_depth=points) for frame in bare]
     with pytest.raises(InputError, match=r"train the method coliags-plus on its points, or .* depth estimate"):
         start(tmp_path / "run", method="scaffold-gs-depth", scene=replace(scene, train=sparse))
-    for train in (bare, sparse):
-        assert start(tmp_path / "run", method="coliags-plus", scene=replace(scene, train=train))
+    for train, warned in ((bare, True), (sparse, False)):
+        caplog.clear()
+        start(tmp_path / "run", method="coliags-plus", scene=replace(scene, train=train))
+        assert ("loss term 'depth' does nothing" in caplog.text) == warned
     estimated = [frame.with_maps(depth_confidence=torch.ones_like(frame.depth)) for frame in scene.train]
     for method, warned in (("coliags", True), ("coliags-plus", False), ("scaffold-gs", False)):
         caplog.clear()
