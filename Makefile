@@ -17,20 +17,20 @@ export PYTHONDONTWRITEBYTECODE :=
 demo: install
 	@echo "1/5  a synthetic colon with exact depth, poses and light ..."
 	@{ $(BIN)/coliags phantom --output $(DEMO)/tiny --overwrite $(TINY) && \
-	   $(BIN)/coliags train coliags --data $(DEMO)/tiny --steps 2 --output $(DEMO)/tiny-run --overwrite; \
+	   $(BIN)/coliags train coliags-plus --data $(DEMO)/tiny --steps 2 --output $(DEMO)/tiny-run --overwrite; \
 	   rm -rf $(DEMO)/tiny $(DEMO)/tiny-run; } >/dev/null 2>&1 & \
 	 $(BIN)/coliags phantom --output $(DEMO)/phantom --seed 0 --frames 60 --rotation-views 6 --size 254x203 --overwrite; \
 	 status=$$?; wait; exit $$status
-	@echo "2/5  ColIAGS, $(DEMO_STEPS) steps: half a minute on two cores ..."
-	@$(BIN)/coliags train coliags --output $(DEMO)/coliags $(DEMO_FLAGS)
+	@echo "2/5  coliags-plus, $(DEMO_STEPS) steps: half a minute on two cores ..."
+	@$(BIN)/coliags train coliags-plus --output $(DEMO)/coliags-plus $(DEMO_FLAGS)
 	@echo "3/5  Scaffold-GS with the same depth supervision, as many steps: half a minute ..."
 	@$(BIN)/coliags train scaffold-gs-depth --output $(DEMO)/scaffold-gs-depth $(DEMO_FLAGS)
 	@echo "4/5  held-out views of both: seconds ..."
-	@$(BIN)/coliags eval $(DEMO)/coliags
+	@$(BIN)/coliags eval $(DEMO)/coliags-plus
 	@$(BIN)/coliags eval $(DEMO)/scaffold-gs-depth
 	@echo "5/5  the report ..."
-	@$(BIN)/coliags report $(DEMO)/coliags $(DEMO)/scaffold-gs-depth --output $(DEMO)/report.html \
-	  --title "ColIAGS and Scaffold-GS on a synthetic colon" \
+	@$(BIN)/coliags report $(DEMO)/coliags-plus $(DEMO)/scaffold-gs-depth --output $(DEMO)/report.html \
+	  --title "coliags-plus and Scaffold-GS on a synthetic colon" \
 	  --note "A demonstration: $(DEMO_STEPS) steps on a CPU, where the paper trains 30,000."
 
 # In a process per CPU, up to four; each would take all CPUs otherwise.
@@ -54,14 +54,13 @@ docs: install-dev $(VENV)/installed-docs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict --config-file docs/tools/mkdocs.yml
 	@echo "built build/site/index.html"
 
-# What docs/results.md has of phantoms-12, from nothing: trials, runs, archive, tables and picture. Some twenty core hours.
+# What docs/results.md has of phantoms-test, from nothing: runs, archive, tables and picture. Some two core hours.
 results: install-dev
-	for part in tune measure plateau write; do \
-	  OMP_NUM_THREADS=1 $(BIN)/python benchmarks/results.py $$part $(RESULTS) || exit 1; \
-	done
-	$(BIN)/python docs/tools/results.py measurement $(addprefix $(RESULTS)/,equal-time paper-rows seeds plateau ladder-*)
-	$(BIN)/python docs/tools/results_page.py
-	$(BIN)/python docs/tools/results_picture.py $(RESULTS)
+	$(BIN)/coliags ablate rivals-in-time --scenes phantoms-test --threads 1 --output $(RESULTS)/phantoms \
+	  --reference coliags-plus --primary psnr depth_mse_inner
+	$(BIN)/python docs/tools/results.py pack $(RESULTS)/phantoms
+	$(BIN)/python docs/tools/results.py tables
+	$(BIN)/python docs/tools/results.py picture $(RESULTS)/phantoms
 
 # The outputs stored in docs/notebooks.
 notebooks: install-dev

@@ -8,6 +8,7 @@ import re
 import shutil
 import subprocess
 import sys
+import tarfile
 from importlib import import_module
 from pathlib import Path
 
@@ -16,7 +17,7 @@ import numpy as np
 import pytest
 import tyro
 
-from coliags_plugin.comparison.named_files import load_ablation
+import coliags_plugin
 from coliags_plugin.core.images import read_rgb, write_image
 from tests.comparison.small import InlineExecutor
 from tests.pipeline.reconstructions import SUBMAPS, join, similarity, write_long
@@ -66,58 +67,28 @@ def test_joins_of_a_procedure_are_judged_by_its_truth(run, monkeypatch, tmp_path
     assert f"| joins of segments | {'1 right, 0 wrong' if is_right else '0 right, 1 wrong'}, 0 not judged |" in table
 
 
-def test_results_are_made_with_what_was_chosen(run, monkeypatch, capsys, tmp_path):
-    results = import_module("results")
+def test_results_are_packed_tabulated_and_drawn(monkeypatch, tmp_path):
     monkeypatch.setattr("coliags_plugin.comparison.compare.make_executor", lambda options: InlineExecutor())
-    methods = load_ablation("rivals")
-    few = [method for method in methods if method.name in ("coliags", "3dgs-depth")]
-    monkeypatch.setattr(results, "load_ablation", lambda name: few if name == "rivals" else few[:1])
-    monkeypatch.setattr(results, "WHOLE", "coliags")
-    tried = {
-        "anchors": [["field.voxel_pixels=9"], ["field.voxel_pixels=6"]],
-        "points": [["datamanager.points_count=100"], ["datamanager.points_count=200", "strategy.every={few}"]],
-    }
-    monkeypatch.setattr(results, "TRIALS", tried)
-    monkeypatch.setattr(results, "LADDER", (2, 4))
-    for name in ("SEVERAL_SEEDS", "TO_PLATEAU"):
-        monkeypatch.setattr(results, name, 1)
-    scene, out = write_wall(tmp_path / "wall", frames=16), tmp_path / "out"
-    options = (out, "--tuning", scene, "--test", scene, "--steps", 4, "--jobs", 1)
-    run("results", "tune", *options)
-    chosen = json.loads((out / "tuned.json").read_text())
-    assert list(chosen) == ["coliags", "3dgs-depth"]
-    for name, changes in (("coliags", tried["anchors"]), ("3dgs-depth", tried["points"])):
-        psnr = [values[0] for values in chosen[name]["trials"].values()]
-        best = [change.format(few=9000) for change in changes[psnr.index(max(psnr))]]
-        assert len(psnr) == 2 and chosen[name]["changes"] == best
-    run("results", "measure", *options)
-    run("results", "plateau", *options)
-    reached = json.loads((out / "plateaus.json").read_text())
-    assert list(reached) == ["coliags"] and list(reached["coliags"]) == ["2", "4"]
-    plan = json.loads((out / "equal-time" / "plan.json").read_text())
-    assert {cell["protocol"] for cell in plan["cells"]} == {"paper", "expected-depth", "median-depth"}
-    assert plan["decided"]["reference"] == "coliags"
-    trained = sorted(path.name[:2] for path in (out / "seeds" / "runs").glob("*/*/s*"))
-    assert trained == ["s1", "s2"], "seed 0 is that of the comparison in equal time"
-    assert "coliags" in (run("results", "write", *options) and (out / "plateau.csv").read_text())
     monkeypatch.syspath_prepend(str(ROOT / "docs" / "tools"))
-    page = import_module("results_page")
-    monkeypatch.setattr(page, "WHOLE", "coliags")
-    tables = page.tables(out)
-    after = page.filled("".join(f"<!-- table {name} -->\nold<!-- end -->" for name in tables), tables)
-    assert all(table in after for table in tables.values()) and "old<" not in after
-    for kind in ("colour", "depth"):
-        assert re.search(r"^\| 3dgs-depth \|.* \| [01] of 1 \| \u2013 \|$", tables[f"with-depth-{kind}"], re.MULTILINE)
-    picture = import_module("results_picture")
-    here = {"METHODS": [*chosen], "CHOSEN_BY": {"test": "psnr"}, "ASSUMED": 0, "PICTURE": tmp_path / "picture.jpg"}
-    for name, value in here.items():
-        monkeypatch.setattr(picture, name, value)
-    picture.main(out)
-    drawn = cv2.imread(str(here["PICTURE"]))[..., ::-1]
-    recorded = read_rgb(scene / "images" / f"{capsys.readouterr().out.split()[-1]}.png")
-    height, width = 2 * recorded.shape[0], 2 * recorded.shape[1]
-    assert drawn.shape == (3 * (24 + height) + 24 + 52, max(2 * width + 8, 480), 3), "three rows, and a scale"
-    assert np.abs(cv2.resize(drawn[48 : 48 + height, :width], None, fx=0.5, fy=0.5) - recorded.astype(float)).mean() < 8
+    tool, scene, out = import_module("results"), write_wall(tmp_path / "wall", frames=16), tmp_path / "walls"
+    coliags_plugin.compare(["coliags", "3dgs-depth"], [scene], out, steps=2, seeds=2, jobs=1)
+    shutil.rmtree(next(out.glob("results/*/3dgs-depth")))
+    first = tmp_path / "first.tar.xz"
+    for archive in (first, tmp_path / "second.tar.xz"):
+        tool.pack([out], archive)
+    assert first.read_bytes() == (tmp_path / "second.tar.xz").read_bytes()
+    with tarfile.open(first) as archive:
+        archive.extractall(tmp_path / "packed", filter="data")
+    page = "".join(f"<!-- table walls {kind} -->\nold<!-- end -->" for kind in tool.TABLES)
+    tables = tool.filled(page, tmp_path / "packed")
+    assert "old" not in tables and "3dgs-depth" not in tables, "cells without a result are left out"
+    psnr = coliags_plugin.load_run(next(out.glob("runs/*/coliags/s0*"))).results["paper"].mean("psnr")
+    assert re.search(rf"^\| coliags \| {psnr:.2f} / [\d.]+ \|", tables, re.MULTILINE)
+    for name, value in (("SHOWN", ("coliags",)), ("CHOSEN_BY", {"test": "psnr"})):
+        monkeypatch.setattr(tool, name, value)
+    drawn = tool.draw(out)
+    height, width = (2 * size for size in read_rgb(next((scene / "images").glob("*.png"))).shape[:2])
+    assert drawn.shape == (2 * (24 + height) + 24 + 52, max(2 * width + 8, 480), 3), "two rows, and a scale"
 
 
 def test_a_factor_of_depth_is_measured_exactly(run, tmp_path):
@@ -175,19 +146,6 @@ def test_the_training_step_of_every_method(run):
     assert [row.split("|")[1].strip() for row in table.splitlines() if row.startswith("| ")][1:] == METHODS
 
 
-@pytest.mark.parametrize("method", ["coliags", "3dgs"])
-def test_a_training_curve_and_its_figure(run, method, tmp_path):
-    write_wall(tmp_path / "wall")
-    options = ("--steps", 4, "--every", 2, "--set", "datamanager.points_count=500")
-    run("training_curve", "--data", tmp_path / "wall", "--method", method, "--out", tmp_path / "run", *options)
-    curve = tmp_path / "run" / "curve.jsonl"
-    rows = [json.loads(line) for line in curve.read_text().splitlines()]
-    assert [row["step"] for row in rows] == [2, 4]
-    assert all(row["elements"] > 0 and row["psnr"] > 0 and row["depth_mse"] >= 0 for row in rows)
-    run("plot_curves", "--out", tmp_path / "curves.svg", "--curves", f"{method}={curve}")
-    assert f">{method}</text>" in (tmp_path / "curves.svg").read_text()
-
-
 def test_growth_with_anchors_pixels_and_frames(run, tmp_path):
     sizes = ("--anchors", "300,600", "--sizes", "48x36", "--frames", "20,40")
     printed = run("growth", *sizes, "--steps", 1, "--json", tmp_path / "rows.json")
@@ -231,12 +189,3 @@ def test_a_part_for_a_gpu_that_fails_is_recorded_and_the_others_run(tmp_path):
     assert status == 0 and set(parts.values()) == {"ok"} and list(parts)[-1] == "report"
     status, parts, _ = gpu_script(tmp_path / "late", "--minutes", "0")
     assert status == 0 and set(parts.values()) == {"no time left"}
-
-
-def test_interpolations_of_gains_are_exact_where_they_must_be(monkeypatch):
-    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
-    errors = import_module("held_out_gains").errors
-    times = np.arange(40.0) + (np.arange(40) >= 20)  # a frame is missing
-    assert errors(times, 0.1 * times, 5) == pytest.approx({"linear": 0.0, "Akima": 0.0, "cubic": 0.0}, abs=1e-12)
-    bent = errors(times, times**2, 5)
-    assert bent["cubic"] == pytest.approx(0.0, abs=1e-9) and bent["linear"] > bent["Akima"] > 0.1

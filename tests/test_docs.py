@@ -8,7 +8,6 @@ import re
 import shlex
 import subprocess
 import sys
-import tarfile
 from functools import cache
 from pathlib import Path
 from runpy import run_path
@@ -27,7 +26,6 @@ from coliags_plugin.core.render_output import OUTPUTS
 from coliags_plugin.core.splits import held_out
 from coliags_plugin.engine.samplers import PURPOSES
 from coliags_plugin.phantom.settings import PRESETS
-from coliags_plugin.results.reading import find_results
 from tests.commands import run
 from tests.scenes import SETS, write_wall
 
@@ -83,7 +81,7 @@ def cited(text: str) -> list[tuple[str, list[str]]]:
     """Pages named in a text, each with the section numbers that follow it, over the ends of commented lines too."""
     text = re.sub(r"\s*\n\s*(?:#:?|\|)?\s*", " ", text)
     number = r"\d+(?:\.\d+)*(?!\w)"
-    named = r"(?<![\w/-])((?:docs/)?(?:layouts/|rivals/|experiments/)?[\w-]+\.md)"
+    named = r"(?<![\w/-])((?:docs/)?(?:layouts/|rivals/)?[\w-]+\.md)"
     pattern = rf"{named}(?:`*,? +({number}(?:(?:, | and ){number})*))?"
     return [(page, re.findall(number, numbers or "")) for page, numbers in re.findall(pattern, text)]
 
@@ -356,17 +354,5 @@ def test_the_table_of_methods_has_every_method_and_constant_with_its_source(name
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize("name", ["comparisons", "measurement", "tracked"])
-def test_tables_of_results_are_those_of_the_archive(name, tmp_path):
-    with tarfile.open(DOCS / "results" / f"{name}.tar.xz") as archive:
-        archive.extractall(tmp_path, filter="data")
-    for folder in tmp_path.iterdir():
-        table = tool("results")["table"](find_results([folder / "results"]))
-        assert (DOCS / "results" / f"{folder.name}.csv").read_text() == table
-        cells = json.loads((folder / "plan.json").read_text())["cells"]
-        assert cells and all((folder / cell["result"]).is_file() for cell in cells)
-
-
-@pytest.mark.thorough
 def test_tables_of_the_page_are_those_of_the_archive():
-    assert tool("results_page")["main"](["--check"]) == 0
+    assert tool("results")["main"]("tables", "--check") == 0

@@ -155,8 +155,8 @@ class ViewModule(nn.Module, ABC, Configurable[SettingsT]):
     def gain_curve(self) -> tuple[Sequence[float], Float[Tensor, "F C"]] | None:
         """Exposure gain over the video, for losses; default: None, without one.
 
-        Index in the video of every training frame, ascending, and the logarithm of its gain, for all colours or for
-        each of three. [F], [F, C]
+        Index in the video of every training frame, ascending, and the learned part of the logarithm of its gain, for
+        all colours or for each of three. [F], [F, C]
         """
         return None
 

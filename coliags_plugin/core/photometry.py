@@ -165,7 +165,7 @@ def _falloff(
 
 
 def fit_light(scene: Scene) -> LightFit | None:
-    """Fit gains, the lamp's place and fall-off over angles; None without depth, or with too few frames or points.
+    """Fit gains, the lamp's place and fall-off over angles; None without true depth, or with few frames or points.
 
     Least squares, reweighted by the residuals, of green of the scene's points at pixels of the same depth:
 
@@ -188,7 +188,8 @@ _FITS: WeakKeyDictionary[Scene, LightFit | None] = WeakKeyDictionary()
 def _fit_scene(scene: Scene) -> LightFit | None:
     everything = scene.points.positions.double()
     points = everything[:: max(1, len(everything) // _POINTS)]
-    if min(len(scene.train), len(points)) < _FEWEST or any(frame.depth is None for frame in scene.train):
+    has_truth = all(frame.depth is not None and frame.depth_confidence is None for frame in scene.train)
+    if min(len(scene.train), len(points)) < _FEWEST or not has_truth:
         return None
     observations = _observe(scene, points, wall_normals(everything, points))
     parameters, log_gains = _lamp(observations)

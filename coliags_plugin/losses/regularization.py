@@ -84,10 +84,10 @@ class SmoothGainSettings(LossSettings):
 
 
 class SmoothGainLoss(Loss[SmoothGainSettings]):
-    """Mean squared curvature of the log gain over time, in frames of the video (docs/methods.md 4.7).
+    """Mean squared curvature of the learned log gain over time, in frames of the video (docs/methods.md 4.7).
 
-    That is the squared change of slope over the distance in which it changes; slopes are those between training frames
-    that follow each other. 0 with fewer than three.
+    The curvature is the squared change of slope over the distance in which it changes; slopes are those between
+    training frames that follow each other. 0 with fewer than three.
     """
 
     def check(self, model: TrainedModel) -> None:

@@ -195,8 +195,8 @@ class FrameGain(ViewModule[FrameGainSettings]):
 
     @property
     def gain_curve(self) -> tuple[Sequence[float], Float[Tensor, "F C"]]:
-        """Index in the video and :meth:`log_gains` of every training frame."""
-        return self.frames.times, self.log_gains()
+        """Index in the video of every training frame, and the learned part of its log gain over its rate."""
+        return self.frames.times, self.log_gain
 
     def log_gains(self) -> Float[Tensor, "F C"]:
         """Logarithm of every training frame's gain, relative to the mean, within its bounds."""

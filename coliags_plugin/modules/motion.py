@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 import torch
 from jaxtyping import Float
@@ -22,9 +22,22 @@ from coliags_plugin.modules.frame_rows import FrameRows
 
 #: Approximate number of scene points that the median depth is computed from.
 _DEPTH_POINTS = 4096
+#: What becomes of views where corrections do not apply.
+_UNCORRECTED = "no view is corrected, as the depth of the scene is not estimated"
 
 
-class PoseCorrection(ViewModule[Settings]):
+class CorrectionSettings(Settings):
+    """Options of corrections per frame."""
+
+    # which scenes are corrected: all, or those whose depth was estimated, and their poses as a rule, from the images
+    scenes: Literal["all", "estimated"] = "all"
+
+    def apply_to(self, scene: Scene) -> bool:
+        """True if frames of a scene are corrected."""
+        return self.scenes == "all" or any(frame.depth_confidence is not None for frame in scene.train)
+
+
+class PoseCorrection(ViewModule[CorrectionSettings]):
     """Learned rotation and translation of each training camera, in world axes.
 
     It turns about the point on its optical axis at the median depth of the scene's points in view (its pivot).
@@ -37,9 +50,9 @@ class PoseCorrection(ViewModule[Settings]):
     camera. Free cameras stay.
     """
 
-    def __init__(self, settings: Settings, scene: Scene) -> None:
+    def __init__(self, settings: CorrectionSettings, scene: Scene) -> None:
         super().__init__(settings, scene)
-        self.frames = FrameRows(scene)
+        self.frames, self._applies = FrameRows(scene), settings.apply_to(scene)
         self._pivot_depths = [_median_depth(frame.camera, scene) for frame in scene.train]
         self.rotation = nn.Parameter(torch.zeros(len(self.frames), 3))
         self.translation = nn.Parameter(torch.zeros(len(self.frames), 3))
@@ -47,6 +60,8 @@ class PoseCorrection(ViewModule[Settings]):
     @property
     def untrained_views(self) -> str:
         """Treatment of views that are not training frames."""
+        if not self._applies:
+            return _UNCORRECTED
         return (
             "views without training have their poses corrected by what is interpolated between the corrections of the "
             "training frames before and after them; views beside the video by that of the nearest training camera"
@@ -58,9 +73,9 @@ class PoseCorrection(ViewModule[Settings]):
 
     def adjust_camera(self, camera: Camera, view: View | None) -> Camera:
         """The camera with the correction of its frame, or of the training frames around it."""
-        row = self.frames.row(view)
-        if view is None:
+        if view is None or not self._applies:
             return camera
+        row = self.frames.row(view)
         before, after, share = self.frames.neighbours(view) if row is None else (row, row, 0.0)
         rotation, translation = (torch.lerp(values[before], values[after], share) for values in self.corrections())
         depth = (1.0 - share) * self._pivot_depths[before] + share * self._pivot_depths[after]
@@ -73,6 +88,8 @@ class PoseCorrection(ViewModule[Settings]):
     @property
     def learned(self) -> JsonObject:
         """Root mean square of the corrections over the training frames."""
+        if not self._applies:
+            return {}
         rotation, translation = (values.detach().square().sum(1).mean().sqrt() for values in self.corrections())
         return {"rotation_degrees": math.degrees(rotation), "translation": float(translation)}
 
@@ -85,7 +102,7 @@ def _median_depth(camera: Camera, scene: Scene) -> float:
     return float(depths[inside].median()) if inside.any() else 0.0
 
 
-class ImageWarpSettings(Settings):
+class ImageWarpSettings(CorrectionSettings):
     """Options of the displacement of images."""
 
     cells: int = Field(default=8, ge=1)  # cells of the grid along either side of the image
@@ -105,13 +122,15 @@ class ImageWarp(ViewModule[ImageWarpSettings]):
 
     def __init__(self, settings: ImageWarpSettings, scene: Scene) -> None:
         super().__init__(settings, scene)
-        self.frames = FrameRows(scene)
+        self.frames, self._applies = FrameRows(scene), settings.apply_to(scene)
         nodes = settings.cells + 1
         self.displacement = nn.Parameter(torch.zeros(len(self.frames), 2, nodes, nodes))
 
     @property
     def untrained_views(self) -> str:
         """Displacement of views that are not training frames."""
+        if not self._applies:
+            return _UNCORRECTED
         return (
             "views without training are displaced by what is interpolated between the training frames before and "
             "after them; views beside the video as the nearest training camera"
@@ -123,7 +142,7 @@ class ImageWarp(ViewModule[ImageWarpSettings]):
 
     def shade(self, output: RenderOutput, view: View | None) -> RenderOutput:
         """Displace the colours."""
-        if view is None:
+        if view is None or not self._applies:
             return output
         nodes = self.frames.interpolated(self.displacements(), view)
         height, width = output.rgb.shape[:2]
@@ -139,4 +158,6 @@ class ImageWarp(ViewModule[ImageWarpSettings]):
     @property
     def learned(self) -> JsonObject:
         """Root mean square of the displacements over the training frames, percent of the image's width."""
+        if not self._applies:
+            return {}
         return {"displacement": float(self.displacements().detach().square().sum(1).mean().sqrt())}

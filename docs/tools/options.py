@@ -149,7 +149,7 @@ def whole_text(found: type) -> str:
 def as_markdown(text: str) -> str:
     """Sphinx's roles as code, and pages of the documentation as links."""
     text = re.sub(r":\w+:`~?([^`]+)`", r"`\1`", text.replace("``", "`"))
-    return re.sub(r"`?docs/((?:layouts/|rivals/|experiments/)?[\w-]+\.md)`?", r"[\1](\1)", text)
+    return re.sub(r"`?docs/((?:layouts/|rivals/)?[\w-]+\.md)`?", r"[\1](\1)", text)
 
 
 def table(settings: type[Settings], own_only: bool = False) -> str:

@@ -98,6 +98,8 @@ def test_the_module_starts_with_them_where_there_is_depth():
     assert without.log_gains().exp().tolist() == [[1.0] * 3] * 7
     few = replace(wall_scene(), train=wall_scene().train[:2])
     assert fit_light(few) is None
+    estimated = [frame.with_maps(depth_confidence=torch.ones_like(frame.depth)) for frame in wall_scene().train]
+    assert fit_light(replace(wall_scene(), train=estimated)) is None
 
 
 OFFSET = torch.tensor([1.0, -0.5, -2.5], dtype=torch.float64)

@@ -62,6 +62,25 @@ def make(frames=9):
     return scene, PoseCorrection(PoseCorrection.Settings(), scene)
 
 
+@pytest.mark.parametrize("module", [PoseCorrection, ImageWarp])
+def test_scenes_whose_depth_is_not_estimated_may_be_left_as_they_are(module):
+    given = wall_scene()
+    estimated = [frame.with_maps(depth_confidence=torch.ones_like(frame.depth)) for frame in given.train]
+    for scene, settings, is_corrected in (
+        (given, module.Settings(), True),
+        (given, module.Settings(scenes="estimated"), False),
+        (replace(given, train=estimated), module.Settings(scenes="estimated"), True),
+    ):
+        part, frame = module(settings, scene), scene.train[3]
+        with torch.no_grad():
+            for values in part.parameters():
+                values[3] = 0.01
+        output = RenderOutput(frame.rgb.float(), torch.ones(frame.rgb.shape[:2]), frame.camera)
+        camera, shaded = part.adjust_camera(frame.camera, frame.view(True)), part.shade(output, frame.view(True))
+        assert (camera is not frame.camera or shaded is not output) == is_corrected
+        assert bool(part.learned) == is_corrected and ("not estimated" in part.untrained_views) != is_corrected
+
+
 def test_corrections_turn_about_what_is_in_view():
     scene, module = make()
     frame = scene.train[3]
