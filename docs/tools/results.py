@@ -1,6 +1,6 @@
 """Archive, tables and picture of docs/results.md, from finished comparisons.
 
-    python docs/tools/results.py pack COMPARISON ...   # docs/results.tar.xz; the same folders give the same bytes
+    python docs/tools/results.py pack COMPARISON ...   # into docs/results.tar.xz; the same results give the same bytes
     python docs/tools/results.py tables [--check]      # writes the archive's tables into the page, or compares them
     python docs/tools/results.py picture COMPARISON    # docs/looks/results.jpg, from the runs of a comparison
 
@@ -177,18 +177,26 @@ def filled(page: str, folder: Path) -> str:
 
 
 def pack(folders: Sequence[Path], archive: Path) -> None:
-    """Write plans and results of comparisons into an archive."""
+    """Write plans and results of comparisons into an archive, in place of those that it has under their names."""
+    contents: dict[str, bytes] = {}
+    if archive.is_file():
+        with tarfile.open(archive) as kept:
+            contents = {member.name: kept.extractfile(member).read() for member in kept}
+    replaced = tuple(f"{folder.name}/" for folder in folders)
+    contents = {name: content for name, content in contents.items() if not name.startswith(replaced)}
+    for folder in folders:
+        plan = json.loads((folder / "plan.json").read_text(encoding="utf-8"))
+        plan["cells"] = [cell for cell in plan["cells"] if (folder / cell["result"]).is_file()]
+        contents[f"{folder.name}/plan.json"] = (json.dumps(plan, indent=2) + "\n").encode()
+        contents |= {
+            f"{folder.name}/{cell['result']}": (folder / cell["result"]).read_bytes() for cell in plan["cells"]
+        }
     packed = io.BytesIO()
     with tarfile.open(fileobj=packed, mode="w", format=tarfile.PAX_FORMAT) as tar:
-        for folder in sorted(folders, key=lambda path: path.name):
-            plan = json.loads((folder / "plan.json").read_text(encoding="utf-8"))
-            plan["cells"] = [cell for cell in plan["cells"] if (folder / cell["result"]).is_file()]
-            contents = {cell["result"]: (folder / cell["result"]).read_bytes() for cell in plan["cells"]}
-            contents["plan.json"] = (json.dumps(plan, indent=2) + "\n").encode()
-            for name, content in sorted(contents.items()):
-                member = tarfile.TarInfo(f"{folder.name}/{name}")
-                member.size = len(content)
-                tar.addfile(member, io.BytesIO(content))
+        for name, content in sorted(contents.items()):
+            member = tarfile.TarInfo(name)
+            member.size = len(content)
+            tar.addfile(member, io.BytesIO(content))
     archive.write_bytes(lzma.compress(packed.getvalue(), preset=9 | lzma.PRESET_EXTREME))
 
 
