@@ -54,8 +54,8 @@ class PoseCorrection(ViewModule[CorrectionSettings]):
         super().__init__(settings, scene)
         self.frames, self._applies = FrameRows(scene), settings.apply_to(scene)
         self._pivot_depths = [_median_depth(frame.camera, scene) for frame in scene.train]
-        self.rotation = nn.Parameter(torch.zeros(len(self.frames), 3))
-        self.translation = nn.Parameter(torch.zeros(len(self.frames), 3))
+        self.rotation = nn.Parameter(torch.zeros(len(self.frames), 3), requires_grad=self._applies)
+        self.translation = nn.Parameter(torch.zeros(len(self.frames), 3), requires_grad=self._applies)
 
     @property
     def untrained_views(self) -> str:
@@ -124,7 +124,7 @@ class ImageWarp(ViewModule[ImageWarpSettings]):
         super().__init__(settings, scene)
         self.frames, self._applies = FrameRows(scene), settings.apply_to(scene)
         nodes = settings.cells + 1
-        self.displacement = nn.Parameter(torch.zeros(len(self.frames), 2, nodes, nodes))
+        self.displacement = nn.Parameter(torch.zeros(len(self.frames), 2, nodes, nodes), requires_grad=self._applies)
 
     @property
     def untrained_views(self) -> str:

@@ -102,34 +102,9 @@ def scenes_table(results: Sequence[Result]) -> str:
     return markdown(["PSNR, dB / inner depth MSE, mm²", *methods], rows)
 
 
-def seeds_table(results: Sequence[Result]) -> str:
-    """Mean PSNR and inner depth MSE of each seed, and the deviation over seeds, of methods that have several."""
-    rows = []
-    for method in names(results, lambda result: result.method):
-        grids = [
-            np.array([[*by_seed.values()] for by_seed in values(results, column)[method].values()])
-            for column in (COLUMNS[0], COLUMNS[4])
-        ]
-        if grids[0].ndim < 2 or grids[0].shape[1] < 2:
-            continue
-        psnr, depth = grids
-        rows.append(
-            [
-                method,
-                " / ".join(text(value, ".2f") for value in psnr.mean(axis=0)),
-                text(np.sqrt(psnr.var(axis=1, ddof=1).mean()), ".2f"),
-                text(psnr.mean(axis=0).std(ddof=1), ".2f"),
-                " / ".join(text(value, "") for value in depth.mean(axis=0)),
-            ]
-        )
-    head = ["method", "PSNR of each seed, dB", "deviation within a scene", "of the mean", "inner depth MSE, mm²"]
-    return markdown(head, rows)
-
-
 TABLES: dict[str, Callable[[Sequence[Result]], str]] = {
     "means": means_table,
     "scenes": scenes_table,
-    "seeds": seeds_table,
 }
 
 

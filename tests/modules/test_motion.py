@@ -78,6 +78,7 @@ def test_scenes_whose_depth_is_not_estimated_may_be_left_as_they_are(module):
         output = RenderOutput(frame.rgb.float(), torch.ones(frame.rgb.shape[:2]), frame.camera)
         camera, shaded = part.adjust_camera(frame.camera, frame.view(True)), part.shade(output, frame.view(True))
         assert (camera is not frame.camera or shaded is not output) == is_corrected
+        assert all(values.requires_grad == is_corrected for values in part.parameters())
         assert bool(part.learned) == is_corrected and ("not estimated" in part.untrained_views) != is_corrected
 
 
