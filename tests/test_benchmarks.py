@@ -89,6 +89,8 @@ def test_results_are_packed_tabulated_and_drawn(monkeypatch, tmp_path):
     drawn = tool.draw(out)
     height, width = (2 * size for size in read_rgb(next((scene / "images").glob("*.png"))).shape[:2])
     assert drawn.shape == (2 * (24 + height) + 24 + 52, max(2 * width + 8, 480), 3), "two rows, and a scale"
+    shown = cv2.resize(drawn[48 : 48 + height, :width], None, fx=0.5, fy=0.5).astype(float)
+    assert min(np.abs(shown - read_rgb(path)).mean() for path in (scene / "images").glob("*.png")) < 8
 
 
 def test_a_factor_of_depth_is_measured_exactly(run, tmp_path):

@@ -188,7 +188,7 @@ _FITS: WeakKeyDictionary[Scene, LightFit | None] = WeakKeyDictionary()
 def _fit_scene(scene: Scene) -> LightFit | None:
     everything = scene.points.positions.double()
     points = everything[:: max(1, len(everything) // _POINTS)]
-    has_truth = all(frame.depth is not None and frame.depth_confidence is None for frame in scene.train)
+    has_truth = all(frame.depth is not None for frame in scene.train) and not scene.has_estimated_depth
     if min(len(scene.train), len(points)) < _FEWEST or not has_truth:
         return None
     observations = _observe(scene, points, wall_normals(everything, points))

@@ -329,6 +329,11 @@ class Scene:
         return sorted([*self.train, *self.test_sets.get("test", ())], key=lambda frame: frame.index)
 
     @property
+    def has_estimated_depth(self) -> bool:
+        """True if depth of the video is an estimate, with a confidence."""
+        return any(frame.depth_confidence is not None for frame in self.video)
+
+    @property
     def is_resized(self) -> bool:
         """True if images are known to be used at another size than they are stored at."""
         return self.provenance.stored_size not in (None, self.provenance.size)

@@ -262,7 +262,7 @@ def _check_points_in_view(config: MethodConfig, scene: Scene) -> None:
 
 def _warn_of_trusted_estimates(scene: Scene, losses: Mapping[str, Loss]) -> None:
     trusting = [key for key, loss in losses.items() if loss.trusts_depth]
-    if trusting and any(frame.depth_confidence is not None for frame in scene.train):
+    if trusting and scene.has_estimated_depth:
         log.warning(
             "the depth of scene '%s' is estimated, and loss term '%s' takes it for true, weighted by its confidence; "
             "the method coliags-plus is made for such scenes",

@@ -34,7 +34,7 @@ class CorrectionSettings(Settings):
 
     def apply_to(self, scene: Scene) -> bool:
         """True if frames of a scene are corrected."""
-        return self.scenes == "all" or any(frame.depth_confidence is not None for frame in scene.train)
+        return self.scenes == "all" or scene.has_estimated_depth
 
 
 class PoseCorrection(ViewModule[CorrectionSettings]):
@@ -53,7 +53,8 @@ class PoseCorrection(ViewModule[CorrectionSettings]):
     def __init__(self, settings: CorrectionSettings, scene: Scene) -> None:
         super().__init__(settings, scene)
         self.frames, self._applies = FrameRows(scene), settings.apply_to(scene)
-        self._pivot_depths = [_median_depth(frame.camera, scene) for frame in scene.train]
+        corrected = scene.train if self._applies else []
+        self._pivot_depths = [_median_depth(frame.camera, scene) for frame in corrected]
         self.rotation = nn.Parameter(torch.zeros(len(self.frames), 3), requires_grad=self._applies)
         self.translation = nn.Parameter(torch.zeros(len(self.frames), 3), requires_grad=self._applies)
 

@@ -110,7 +110,7 @@ def check_scene(
     images, lamp = rules.image_facts(sample), rules.lamp_facts(sample)
     can_disagree = path and path["length"] and depth and not rules.is_flat(depth)
     measured = [
-        ("agreement", rules.agreement_facts(agreements, scale, is_estimated(video)) if can_disagree else None),
+        ("agreement", rules.agreement_facts(agreements, scale, scene.has_estimated_depth) if can_disagree else None),
         ("matches", rules.match_facts(matches)),
         ("points", dict(vars(scene.provenance))),
         ("depth", depth and depth | {"metric": scene.is_metric}),
@@ -122,11 +122,6 @@ def check_scene(
     findings = [finding for about, values in measured for finding in rules.findings_of(about, values)]
     facts = {"depth": depth, "path": path, "images": images, "lamp": lamp}
     return SceneCheck(scene, pairs, facts, agreements, scale, matches, matched_by, findings, undecided)
-
-
-def is_estimated(frames: Sequence[Frame]) -> bool:
-    """Return whether the depth of frames is an estimate, with a confidence."""
-    return any(frame.depth_confidence is not None for frame in frames)
 
 
 def _match(

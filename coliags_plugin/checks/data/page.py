@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from coliags_plugin.checks.data.check import SceneCheck, is_estimated
+from coliags_plugin.checks.data.check import SceneCheck
 from coliags_plugin.checks.data.findings import Finding, angle_across
 from coliags_plugin.checks.data.hypotheses import LEAST_CONFIDENCE, warp_image
 from coliags_plugin.core.images import sizes_text
@@ -100,7 +100,7 @@ def _agreement(check: SceneCheck) -> list[model.Paragraph | model.Table]:
     gaps = [target.index - source.index for source, target in check.pairs] or [0]
     apart = f"{min(gaps)} to {max(gaps)} frames"
     if check.agreement:
-        estimated = is_estimated(check.scene.video)
+        estimated = check.scene.has_estimated_depth
         trusted = f" of depth with a confidence of {LEAST_CONFIDENCE:g} or more" if estimated else ""
         note = (
             f"Each of {len(check.pairs)} frames is reprojected {apart} ahead by depth, poses and calibration; medians "
