@@ -207,6 +207,7 @@ _BUILT_INS: dict[tuple[str, str], dict[str, object]] = {
         "d-ssim": "coliags_plugin.losses.target:DSSIMLoss",
         "mse": "coliags_plugin.losses.target:MSELoss",
         "depth-l1": "coliags_plugin.losses.target:DepthL1Loss",
+        "anisotropy": "coliags_plugin.losses.regularization:AnisotropyLoss",
         "attribute-variance": "coliags_plugin.losses.regularization:AttributeVarianceLoss",
         "diffuse-factor": "coliags_plugin.losses.regularization:DiffuseFactorLoss",
         "depth-huber": "coliags_plugin.losses.target:DepthHuberLoss",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import reduce
@@ -208,6 +209,31 @@ class ScaleVolumeLoss(Loss):
         scales = step.output.drawn.gaussians.scales
         volumes = reduce(torch.mul, scales.unbind(dim=-1))  # the derivative of ``Tensor.prod`` is slower
         return volumes.sum() / max(len(scales), 1)
+
+
+class AnisotropySettings(LossSettings):
+    """Options of the loss on needles."""
+
+    max_ratio: float = Field(
+        default=4.0, ge=1
+    )  # ratio of the two largest scales that costs nothing
+
+
+class AnisotropyLoss(Loss[AnisotropySettings]):
+    """Mean of log(r / ``max_ratio``) where positive, r the ratio of the two largest scales of every Gaussian drawn.
+
+    Flat Gaussians cost nothing. Needles do: from the training views most of them look right, from others they stick out
+    (docs/methods.md 4.15).
+    """
+
+    needs_splats: ClassVar[bool] = True
+
+    def __call__(self, step: TrainingStep) -> Float[Tensor, ""]:
+        """The unweighted term; 0 where the camera sees no Gaussians."""
+        scales = step.output.drawn.gaussians.scales
+        smallest = torch.finfo(scales.dtype).tiny  # scales can underflow to 0
+        largest, second = scales.topk(2, dim=1).values.clamp(min=smallest).log().unbind(1)
+        return (largest - second - math.log(self.settings.max_ratio)).clamp(min=0.0).sum() / max(len(scales), 1)
 
 
 class SurfaceNormalsSettings(LossSettings):

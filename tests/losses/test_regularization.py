@@ -9,6 +9,8 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 
 from coliags_plugin.contracts import Schedule
 from coliags_plugin.core.cameras import Camera
@@ -235,7 +237,33 @@ def test_a_field_without_the_channel_is_refused(name, options, channels, words):
         make(name, **options).loss.check(model)
 
 
-# Volumes
+# Scales
+
+
+def anisotropy(scales, **options):
+    return make("anisotropy", **options)(make_output(torch.zeros(2, 2, 3), scales), make_frame(torch.zeros(2, 2, 3)))
+
+
+def test_anisotropy_counts_needles_and_neither_discs_nor_spheres():
+    disc, sphere, needle = [0.01, 2.0, 2.0], [1.0, 1.0, 1.0], [8.0, 0.5, 0.01]
+    assert anisotropy(torch.tensor([disc, sphere])).item() == 0.0
+    assert anisotropy(torch.tensor([disc, needle])).item() == pytest.approx(math.log(16 / 4) / 2)
+    assert anisotropy(torch.tensor([needle[:2]]), max_ratio=2.0).item() == pytest.approx(math.log(16 / 2))
+
+
+@given(scale=st.floats(1e-3, 1e3), ratio=st.floats(4.1, 1e4))
+def test_anisotropy_needs_no_unit_of_length_and_pulls_alike_at_every_ratio(scale, ratio):
+    scales = torch.tensor([[ratio, 1.0, 0.3]]).mul(scale).log().requires_grad_()
+    term = anisotropy(scales.exp())
+    term.backward()
+    assert term.item() == pytest.approx(math.log(ratio / 4), abs=1e-4)
+    assert scales.grad[0].tolist() == pytest.approx([1.0, -1.0, 0.0], abs=1e-4)
+
+
+def test_anisotropy_of_a_scale_that_underflows_has_a_finite_gradient():
+    scales = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, 0.0]], requires_grad=True)
+    anisotropy(scales).backward()
+    assert scales.grad.tolist() == [[0.5, 0.0, 0.0], [0.0, 0.0, 0.0]]
 
 
 def volume(scales):
