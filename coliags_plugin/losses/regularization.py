@@ -214,9 +214,7 @@ class ScaleVolumeLoss(Loss):
 class AnisotropySettings(LossSettings):
     """Options of the loss on needles."""
 
-    max_ratio: float = Field(
-        default=4.0, ge=1
-    )  # ratio of the two largest scales that costs nothing
+    max_ratio: float = Field(default=4.0, ge=1)  # ratio of the two largest scales that costs nothing
 
 
 class AnisotropyLoss(Loss[AnisotropySettings]):
