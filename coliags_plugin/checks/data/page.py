@@ -14,7 +14,14 @@ from coliags_plugin.checks.data.hypotheses import LEAST_CONFIDENCE, warp_image
 from coliags_plugin.core.images import sizes_text
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.reporting import model
-from coliags_plugin.reporting.colormaps import RGB_ERROR_LIMIT, colorize_depth, colorize_error, rgb_error
+from coliags_plugin.reporting.colormaps import (
+    RGB_ERROR_LIMIT,
+    colorize_depth,
+    colorize_error,
+    depth_limits,
+    depth_scale_text,
+    rgb_error,
+)
 from coliags_plugin.reporting.image_files import EncodedImage, eight_bit
 from coliags_plugin.reporting.numbers import counted, sentence, short_number
 
@@ -151,12 +158,8 @@ def _pair_images(source: Frame, target: Frame, unit: str) -> model.Figures:
             ),
         ]
     if target.depth is not None:
-        depth = target.depth.numpy()
-        finite = depth[np.isfinite(depth)]
-        if len(finite):
-            low, high = (float(value) for value in np.quantile(finite, (0.01, 0.99)))
-            limits = (low, max(high, low * 1.001))
-            images.append((colorize_depth(depth, limits), f"z-depth, {low:.3g} to {high:.3g} {unit}"))
+        limits = depth_limits([target.depth])
+        images.append((colorize_depth(target.depth, limits), f"z-depth, {depth_scale_text(limits, unit)}"))
     return model.Figures(
         [model.Image(EncodedImage.png(rgb), caption) for rgb, caption in images],
         f"{source.name} and {target.name}",

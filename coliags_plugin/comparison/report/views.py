@@ -18,8 +18,8 @@ from coliags_plugin.core.images import read_rgb
 from coliags_plugin.reporting.colormaps import (
     colorize_depth,
     colorize_error,
-    common_limits,
     depth_error,
+    depth_limits,
     hatch,
     rgb_error,
 )
@@ -171,25 +171,27 @@ def view_section(study: Study, reference: str, count: int) -> Section:
     if not views:
         text = "No images: only results files are here, without the run folders."
         return Section(title, [Paragraph(text)], screen_only=True)
-    error_ends, depth_limits = _scales(views)
-    unit = study.length_unit
+    error_ends, limits_of, unit = _error_ends(views), _depth_limits(views), study.length_unit
     bars = [
         ColorBar(
             (0.0, end), unit if kind == "depth" else "levels of 255", "error", f"|{kind} error|", f"{kind}-error-scale"
         )
         for kind, end in error_ends.items()
     ]
-    if depth_limits is not None:
-        bars.append(ColorBar(depth_limits, unit, "depth", "depth", "depth-scale"))
+    depth_bars = {
+        scene: ColorBar(limits, unit, "depth", "depth", f"depth-scale-{index}")
+        for index, (scene, limits) in enumerate(limits_of.items())
+    }
     values = {
         "bars": bars,
-        "hatch": None if depth_limits is None else EncodedImage.webp(hatch(14, 34)),
+        "hatch": EncodedImage.webp(hatch(14, 34)) if limits_of else None,
         "reference": reference,
         "scenes": [
             (
                 scene,
+                depth_bars.get(scene),
                 [
-                    (test_set.title, [_template_values(view, error_ends, depth_limits) for view in same])
+                    (test_set.title, [_template_values(view, error_ends, limits_of.get(scene)) for view in same])
                     for test_set, same in grouped(in_scene, lambda view: view.frame.test_set).items()
                 ],
             )
@@ -200,7 +202,8 @@ def view_section(study: Study, reference: str, count: int) -> Section:
     explanation = (
         f"Frames spread along each video, and the worst of {reference}. With each rendering, its absolute error, of "
         "depth, or where there is no true depth of colour (the mean of red, green and blue), and the expected depth, "
-        "hatched where alpha is below 0.5. One scale serves every method, frame and scene of this page; it ends at the "
+        "hatched where alpha is below 0.5. One scale of errors serves this page, and one of depth, logarithmic, each "
+        "scene. That of errors ends at the "
         f"smallest 1, 2 or 5 times a power of ten below which {_SCALE_PERCENTILE:.0f} % of all errors shown lie. "
         "Errors beyond it, and missing depth where the truth has one, take its last colour. Of several seeds, the "
         "first is shown. Photographs are JPEG here; the run folders keep them as PNG."
@@ -209,22 +212,27 @@ def view_section(study: Study, reference: str, count: int) -> Section:
     return Section(title, blocks, screen_only=True, name="views")
 
 
-def _scales(views: Sequence[_View]) -> tuple[dict[str, float], tuple[float, float] | None]:
-    """Ends of the scales of errors by their kinds, and limits of depth, each where there is any.
-
-    The limits are those of the true depths, or of the expected ones where there is no true depth.
-    """
-    ends = {
+def _error_ends(views: Sequence[_View]) -> dict[str, float]:
+    """Ends of the scales of errors by their kinds."""
+    return {
         kind: error_limit([each.error for view in same for each in view.renderings if each.error is not None])
         for kind, same in grouped(views, lambda view: view.kind).items()
     }
-    depths = [view.true_depth for view in views if view.true_depth is not None]
-    depths = depths or [each.expected for view in views for each in view.renderings if each.expected is not None]
-    return ends, common_limits(depths) if depths else None
+
+
+def _depth_limits(views: Sequence[_View]) -> dict[str, tuple[float, float]]:
+    """Limits of depth by scene: of the true depths, or where there are none, of the expected ones."""
+    limits = {}
+    for scene, same in grouped(views, lambda view: view.frame.scene).items():
+        depths = [view.true_depth for view in same if view.true_depth is not None]
+        depths = depths or [each.expected for view in same for each in view.renderings if each.expected is not None]
+        if depths:
+            limits[scene] = depth_limits(depths)
+    return limits
 
 
 def _template_values(
-    view: _View, error_ends: Mapping[str, float], depth_limits: tuple[float, float] | None
+    view: _View, error_ends: Mapping[str, float], limits: tuple[float, float] | None
 ) -> dict[str, Any]:
     """Values of a view for the template."""
     frame, where = view.frame, f"frame {view.frame.name}"
@@ -232,8 +240,8 @@ def _template_values(
     truth = EncodedImage.jpeg(view.truth)
     tiles: list[_Tile] = [(truth, f"{where}, true image")]
     caption = []
-    if view.true_depth is not None and depth_limits is not None:
-        tiles.append((EncodedImage.webp(colorize_depth(view.true_depth, depth_limits)), f"{where}, true depth"))
+    if view.true_depth is not None and limits is not None:
+        tiles.append((EncodedImage.webp(colorize_depth(view.true_depth, limits)), f"{where}, true depth"))
         caption = ["above: camera image", "below: true depth"]
     elif not view.in_row:
         tiles.append((None, "no true depth"))
@@ -246,8 +254,8 @@ def _template_values(
         else:
             drawn = colorize_error(rendering.error, error_ends[view.kind])
             tiles.append((EncodedImage.webp(drawn), f"{where}, absolute {view.kind} error of {name}"))
-            if rendering.expected is not None and depth_limits is not None:
-                drawn = colorize_depth(rendering.expected, depth_limits, hatched=True)
+            if rendering.expected is not None and limits is not None:
+                drawn = colorize_depth(rendering.expected, limits, hatched=True)
                 tiles.append((EncodedImage.webp(drawn), f"{where}, expected depth of {name}"))
         cells.append((name, study.methods.index(name), tiles, _caption(frame, rendering.run)))
     count = f"{frame.position + 1} of {len(test_set.frames(frame.scene))}"
