@@ -163,7 +163,7 @@ class DepthCommand:
             reading = ["initial_points=none", "keep_pixels=false", *of_manager]
             scene = open_scene(self.scene, self.data_format, reading, progress)
             near_far = None if self.near is None or self.far is None else (self.near, self.far)
-            summary, warnings = estimate_scene(
+            summary, warnings, _ = estimate_scene(
                 scene, self.output, settings, near_far, self.prior, self.jobs, self.overwrite, progress
             )
         for warning in warnings:
@@ -289,8 +289,9 @@ def every_of(source: FrameSource, rate: float) -> int:
 
 def _lines(contents: Contents) -> Iterator[str]:
     """Lines of what a video came to: stages and files, segments and joins of a long one, sub-maps, and remarks."""
-    from coliags_plugin.pipeline.page import held_out_text, remarks, submap_table
+    from coliags_plugin.pipeline.page import held_out_text, remarks, submap_table, verdicts_text
     from coliags_plugin.reporting.text_formats import terminal_text
+    from coliags_plugin.surface.coverage.writing import RESEARCH_USE
 
     folder, submaps = contents.folder, [submap for submap in contents.submaps if submap.stages]
     stages = {name: stage for name, stage in contents.stages.items() if "/" not in name}
@@ -306,6 +307,8 @@ def _lines(contents: Contents) -> Iterator[str]:
         models = [f"{name}/{Path(model).name}" if model else name for name, model in join.keys]
         yield f"{' and '.join(models)}: {'joined' if join.joined else f'not joined: {join.reason}'}"
     if len(submaps) > 1:
-        yield from (f"{folder / submap.folder}: {submap.name}" for submap in submaps)
+        yield f"geometry of sub-maps: {verdicts_text(contents)}"
+        yield from (f"{folder / submap.folder}: {submap.name}, {submap.outcome}" for submap in submaps)
         yield from ("", terminal_text([submap_table(contents)]), "", f"held-out PSNR: {held_out_text(submaps)}")
     yield from remarks(contents)
+    yield RESEARCH_USE

@@ -27,8 +27,8 @@ from coliags_plugin.reporting.colormaps import (
     color_bar,
     colorize_depth,
     colorize_error,
-    depth_limits,
     depth_error,
+    depth_limits,
 )
 from coliags_plugin.reporting.image_files import eight_bit, read_depth_tiff, write_depth_tiff, write_png
 from coliags_plugin.results.hashing import code_key, metrics_sha256, plain_config, result_key

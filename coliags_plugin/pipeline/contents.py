@@ -23,14 +23,15 @@ from coliags_plugin.geometry.poses import colmap, tum
 from coliags_plugin.geometry.poses.trajectory import Trajectory
 from coliags_plugin.pipeline.frames import FramesRecord
 from coliags_plugin.pipeline.joins import ModelKey, SegmentJoin
-from coliags_plugin.pipeline.stages import MADE, RECORD_FILE, SHARED, Record, StageRecord
+from coliags_plugin.pipeline.stages import MADE, RECORD_FILE, SHARED, Record, StageRecord, submap_name
 from coliags_plugin.pipeline.survey import SURVEY_FILE, Segment, Survey, Video
 
 #: Name of the record of an export, and version of its schema.
 MANIFEST, _FORMAT = "manifest.json", 1
-_FRAME_NAME = re.compile(r"frame_(\d+)")
+#: Name of a frame of a video, with its number.
+FRAME_NAME = re.compile(r"frame_(\d+)")
 #: Figures that are words.
-_TEXTS = ("unit", "depth_scale")
+_TEXTS = ("unit", "depth_scale", "verdict")
 
 ModelT = TypeVar("ModelT", bound=BaseModel)
 
@@ -58,7 +59,7 @@ class SubmapContents:
     @property
     def name(self) -> str:
         """Name on pages and in folders: segment and number."""
-        return f"{self.segment}/{self.number}" if self.segment else f"sub-map {self.number}"
+        return submap_name(self.segment, self.number)
 
     @property
     def folder(self) -> str:
@@ -78,21 +79,30 @@ class SubmapContents:
     @cached_property
     def figures(self) -> dict[str, Any]:
         """The numbers of all its stages; of a damaged record, those that are numbers."""
-        figures: dict[str, Any] = {
+        return {
             name: value
             for stage in self.stages.values()
             for name, value in stage.figures.items()
             if isinstance(value, str) == (name in _TEXTS) and isinstance(value, int | float | str)
         }
-        if {"psnr", "psnr_training"} <= figures.keys():
-            figures["gap"] = figures["psnr_training"] - figures["psnr"]
-        return figures
+
+    @property
+    def counts(self) -> bool:
+        """True if its figures are of a surface: its geometry is usable or doubtful."""
+        return self.figures.get("verdict") in ("usable", "doubtful")
 
     @property
     def failure(self) -> str:
         """The stage that failed, and why; empty where none did."""
         failed = (f"{name} failed: {stage.summary}" for name, stage in self.stages.items() if stage.state == "failed")
         return next(failed, "")
+
+    @property
+    def outcome(self) -> str:
+        """The verdict on its geometry with the reasons, or why there is none."""
+        if not self.stages:
+            return "too few frames to be reconstructed"
+        return self.failure or (self.stages["verdict"].summary if "verdict" in self.stages else "not judged yet")
 
 
 @dataclass(frozen=True)
@@ -240,7 +250,7 @@ def _frame_numbers(atlas: AtlasRecord, numbers: Mapping[str, int], video: Video)
         if Path(file).name != file:
             raise ValueError(f"the name '{file}'")
         name = Path(file).stem
-        match = _FRAME_NAME.fullmatch(name)
+        match = FRAME_NAME.fullmatch(name)
         number = numbers.get(name, int(match.group(1)) if match else -1)
         if not video.first <= number < video.stop:
             raise ValueError(f"{file} is none of the frames {video.first} to {video.stop - 1}")

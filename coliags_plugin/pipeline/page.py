@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from urllib.parse import quote
 
@@ -18,13 +19,8 @@ from coliags_plugin.core.images import read_rgb
 from coliags_plugin.pipeline.contents import Contents, SubmapContents, common_frames, read_contents
 from coliags_plugin.pipeline.joins import ModelKey
 from coliags_plugin.pipeline.stages import OUTPUTS, PAGE_FILE, Record, StageRecord
-from coliags_plugin.pipeline.timeline import (
-    State,
-    clock_span,
-    frame_states,
-    span_text,
-    timeline,
-)
+from coliags_plugin.pipeline.timeline import State, clock_span, frame_states, span_text, timeline, with_times
+from coliags_plugin.pipeline.verdict import VERDICTS
 from coliags_plugin.reporting.html_page import write_html
 from coliags_plugin.reporting.image_files import EncodedImage
 from coliags_plugin.reporting.model import (
@@ -48,6 +44,7 @@ from coliags_plugin.reporting.model import (
     simple_table,
 )
 from coliags_plugin.reporting.numbers import area_text, counted, duration, letters
+from coliags_plugin.surface.coverage.writing import RESEARCH_USE
 
 #: Largest page, bytes, and how much of it are scenes.
 _LIMIT, _SCENES = 50_000_000, 36_000_000
@@ -62,9 +59,12 @@ _NAMED = 5
 #: Columns that are left out where no sub-map has them.
 _WHERE_KNOWN = ("span", "group", "psnr_pose_refined", "seen")
 _TIMELINE = (
-    "From left to right, the video. Each colour is a sub-map, whose parts share one frame of reference; grey has no "
-    "pose. Brackets are segments, dashed where they failed. Point at a place for frames and reasons."
+    "From left to right, the video. Each colour, with its number, is a sub-map, whose parts share one frame of "
+    "reference; grey has no pose. Brackets are segments, dashed where they failed. Point at a place for frames and "
+    "reasons."
 )
+#: How lengths get a unit.
+_NO_UNIT = "the colon's inner diameter gives mm: `coliags reconstruct VIDEO --output OUT --diameter 40`"
 #: What to do where the poses of a sub-map are suspect.
 _SUSPECT = (
     "there the surface may be bent or torn. Compare the held-out views, and see check.html. Better poses may come from "
@@ -84,17 +84,18 @@ def write_page(out: Path, record: Record | None = None) -> None:
     contents = read_contents(out, record)
     states = frame_states(contents)
     sections = [
+        Section("Sub-maps", list(_submaps(contents))),
         Section("Scenes", list(_scenes(contents))),
         Section("Depth and light", list(_pictures(contents))),
         *_views(contents),
-        Section("Sub-maps", list(_submaps(contents))),
     ]
     if contents.has_frames:
         sections.insert(0, Section("Time line", [Paragraph(_TIMELINE), timeline(contents, states)]))
         sections.append(Section("Frames without a pose", [_without_pose(contents, states)]))
     sections.append(Section("Stages and files", list(_stages(contents))))
     title = f"Reconstruction of {contents.video.source}"
-    page = Page(title, sections, list(_facts(contents)), "For research use only.", remarks(contents))
+    cautions = [with_times(contents, remark) for remark in remarks(contents)]
+    page = Page(title, sections, list(_facts(contents)), RESEARCH_USE, cautions)
     write_html(page, out / PAGE_FILE, _LIMIT)
 
 
@@ -112,10 +113,8 @@ def _facts(contents: Contents) -> Iterator[Fact]:
         failed = sum(bool(segment.failure) for segment in contents.segments)
         note = f"{failed} failed or not finished" if failed else ""
         yield Fact("Segments", f"{count - failed} of {count}", note=note)
-    submaps = [submap for submap in contents.submaps if submap.stages]
-    failed = sum(bool(submap.failure) for submap in submaps)
-    reconstructed = f"{len(submaps) - failed} reconstructed of {len(contents.submaps)}"
-    yield Fact("Sub-maps", reconstructed, note=f"{failed} failed" if failed else "")
+    submaps = [submap for submap in contents.submaps if submap.counts]
+    yield Fact("Geometry of sub-maps", verdicts_text(contents))
     if contents.joins:
         joined = {join.segments for join in contents.joins if join.joined}
         places = counted(len({join.segments for join in contents.joins}), "place")
@@ -123,24 +122,36 @@ def _facts(contents: Contents) -> Iterator[Fact]:
     yield Fact("Held-out PSNR", held_out_text(submaps))
     metric = [submap.figures for submap in submaps if submap.figures.get("unit") == "mm"]
     if areas := [figures["area"] for figures in metric if "area" in figures]:
-        note = f"of {counted(len(areas), 'sub-map')} with lengths in mm"
+        note = f"of {counted(len(areas), 'sub-map')}, usable or doubtful, with lengths in mm"
         yield Fact("Area", area_text(sum(areas), metric=True), note=note)
     if shares := [figures["seen"] for figures in metric if "seen" in figures]:
         mean = 100.0 * sum(shares) / len(shares)
-        yield Fact("Wall seen", f"{mean:.0f} % in the mean over {counted(len(shares), 'sub-map')}")
-    if submaps and len(metric) < len(submaps):
-        yield Fact("Unit of length", f"mm of {len(metric)} of {len(submaps)} sub-maps" if metric else "unknown")
+        yield Fact("Wall seen", f"{mean:.0f} % in the mean over {counted(len(shares), 'sub-map')}, usable or doubtful")
+    units = [submap.figures["unit"] for submap in contents.submaps if "unit" in submap.figures]
+    if (known := units.count("mm")) < len(units):
+        unit = f"mm of {known} of {len(units)} sub-maps" if known else "unknown"
+        yield Fact("Unit of length", unit, note=_NO_UNIT)
     seconds = sum(stage.seconds for stage in contents.stages.values())
     yield Fact("Time of all stages", duration(seconds) if seconds else None)
 
 
+def verdicts_text(contents: Contents) -> str:
+    """Counts of sub-maps by the verdict on their geometry, and of others: ``3 usable, 1 not usable, 1 failed``."""
+    words = Counter[str]()
+    for submap in contents.submaps:
+        unjudged = "failed" if submap.failure else "not judged yet" if submap.stages else "too small"
+        words[submap.figures.get("verdict", unjudged)] += 1
+    order = (*VERDICTS, "failed", "not judged yet", "too small")
+    return ", ".join(f"{words[word]} {word}" for word in order if words[word])
+
+
 def held_out_text(submaps: Sequence[SubmapContents]) -> str:
-    """Mean held-out PSNR of sub-maps, and the least and the largest; empty where nothing was evaluated."""
-    values = [psnr for submap in submaps if (psnr := submap.figures.get("psnr")) is not None]
+    """Mean held-out PSNR of usable and doubtful sub-maps, the least and the largest; empty where there is none."""
+    values = [submap.figures["psnr"] for submap in submaps if submap.counts and "psnr" in submap.figures]
     if len(values) < 2:
         return "".join(f"{psnr:.2f} dB" for psnr in values)
-    mean = sum(values) / len(values)
-    return f"{mean:.2f} dB in the mean over {len(values)} sub-maps, {min(values):.2f} to {max(values):.2f}"
+    mean, least, largest = sum(values) / len(values), min(values), max(values)
+    return f"{mean:.2f} dB in the mean over {len(values)} sub-maps, usable or doubtful, {least:.2f} to {largest:.2f}"
 
 
 def remarks(contents: Contents) -> list[str]:
@@ -213,8 +224,7 @@ def _scenes(contents: Contents) -> Iterator[Block]:
             page = file.read_text(encoding="utf-8")
             size = len(escape(page).encode())
             room, page = (room - size, page) if size <= room else (room, None)
-        times = clock_span(contents, submap.first, submap.last) if submap.names else ""
-        scenes.append((", ".join(filter(None, (submap.name, times))), quote(path.as_posix()), page))
+        scenes.append((_titled(contents, submap), quote(path.as_posix()), page))
     if any(page is None for _, _, page in scenes):
         yield Paragraph("The longest sub-maps are within this page, others are loaded from the folder it lies in.")
     if scenes:
@@ -225,12 +235,17 @@ def _pictures(contents: Contents) -> Iterator[Block]:
     """Frames, their depth and the wall in flattened light, side by side, of the longest sub-maps."""
     for index, submap in enumerate(_longest_first(contents)[:_SUBMAPS]):
         scale = submap.figures.get("depth_scale")
-        blocks: list[Block] = [Paragraph(f"Colours: {scale}, dark is near.")] if scale else []
+        blocks: list[Block] = [Paragraph(f"Depth: {scale}; dark is near.")] if scale else []
         for frame in sorted(contents.folder.joinpath(submap.folder, _PICTURES).glob("*")):
             files = [file for kind in _KINDS for file in frame.glob(kind)]
-            blocks.append(Figures([Image(EncodedImage.png(read_rgb(file)), file.stem) for file in files], frame.name))
+            blocks.append(
+                Figures(
+                    [Image(EncodedImage.png(read_rgb(file)), file.stem) for file in files],
+                    with_times(contents, frame.name),
+                )
+            )
         if blocks:
-            yield Folded(submap.name, blocks, is_open=index == 0)
+            yield Folded(_titled(contents, submap), blocks, is_open=index == 0)
 
 
 def _views(contents: Contents) -> list[Section]:
@@ -243,9 +258,10 @@ def _views(contents: Contents) -> list[Section]:
             for path in submap.stages["evaluate"].files:
                 evaluation = contents.folder / path
                 run = read_study([evaluation.parent.parent], evaluation.name).runs[0]
-                scene = run.result.scene.model_copy(update={"name": submap.name})
+                scene = run.result.scene.model_copy(update={"name": _titled(contents, submap)})
                 runs.append(replace(run, result=run.result.model_copy(update={"scene": scene})))
-        section = [view_section(Study(tuple(runs)), runs[0].method, _VIEWS)] if runs else []
+        label = partial(with_times, contents)
+        section = [view_section(Study(tuple(runs)), runs[0].method, _VIEWS, label)] if runs else []
     except InputError as error:
         why = str(error).replace(f"{contents.folder}/", "").replace(str(contents.folder), contents.folder.name)
         return [Section("Held-out views", [Paragraph(why, hint=False)])]
@@ -256,8 +272,9 @@ def _views(contents: Contents) -> list[Section]:
 
 
 def _submaps(contents: Contents) -> Iterator[Block]:
-    """Figures of the sub-maps, and their joins."""
+    """Verdicts on the sub-maps, their figures, and their joins."""
     if contents.submaps:
+        yield verdicts(contents)
         yield submap_table(contents)
     else:
         yield Paragraph("No sub-map was reconstructed.", hint=False)
@@ -265,10 +282,22 @@ def _submaps(contents: Contents) -> Iterator[Block]:
         yield Folded("Joins of segments", [_joins(contents)], is_open=len(contents.joins) <= _NAMED)
 
 
+def verdicts(contents: Contents) -> Bullets:
+    """The verdict on the geometry of each sub-map and the reasons, or why there is none."""
+    return Bullets([Bullet(submap.outcome, submap.name) for submap in contents.submaps])
+
+
+def _titled(contents: Contents, submap: SubmapContents) -> str:
+    """Name, times and verdict: ``sub-map 1, 0:05 to 0:06, doubtful``."""
+    times = clock_span(contents, submap.first, submap.last) if submap.names else ""
+    return ", ".join(filter(None, (submap.name, times, submap.figures.get("verdict", ""))))
+
+
 def submap_table(contents: Contents) -> Table:
-    """Table of the figures of the sub-maps, and of their means."""
+    """Table of the figures of the sub-maps, and of the means of those that are usable or doubtful."""
     columns = [
         Column("submap", "Sub-map", words=True),
+        Column("verdict", "Geometry", words=True),
         Column("frames", "Frames"),
         Column("span", "In the video", words=True),
         Column("group", "Joined as", words=True),
@@ -286,7 +315,7 @@ def submap_table(contents: Contents) -> Table:
     submaps, groups = contents.submaps, _groups(contents)
     rows: list[dict[str, Value | TableCell]] = [
         {
-            **{key: submap.figures.get(key) for key in ("held_out", "steps")},
+            **{key: submap.figures.get(key) for key in ("verdict", "held_out", "steps")},
             "frames": submap.figures.get("frames", len(submap.names)),
             "submap": submap.name,
             "span": span_text(contents, submap.first, submap.last).removeprefix("frames ") if submap.names else None,
@@ -304,16 +333,16 @@ def submap_table(contents: Contents) -> Table:
             continue
         values = [submap.figures.get(column.key) for submap in submaps]
         if len(submaps) > 1:
-            numbers = [value for value in values if value is not None]
+            numbers = [
+                submap.figures[column.key] for submap in submaps if submap.counts and column.key in submap.figures
+            ]
             values.append(sum(numbers) / len(numbers) if numbers else None)
         for row, cell in zip(rows, ranked_cells(values, column.unit, None), strict=True):
             row[column.key] = cell
-    for row, submap in zip(rows, submaps, strict=False):
-        if note := submap.failure or ("" if submap.stages else "too few frames to be reconstructed"):
-            row["psnr"] = replace(as_cell(row["psnr"]), note=note)
     there = {key for row in rows for key, value in row.items() if as_cell(value).text}
     shown = [column for column in columns if column.key not in _WHERE_KNOWN or column.key in there]
-    return Table("", shown, rows, name="submaps")
+    notes = ["Means are of the usable and the doubtful ones"] if len(submaps) > 1 else []
+    return Table("", shown, rows, notes, name="submaps")
 
 
 def _area_of(submap: SubmapContents, name: str) -> str | None:
@@ -323,7 +352,9 @@ def _area_of(submap: SubmapContents, name: str) -> str | None:
 
 
 def _seen_of(submap: SubmapContents) -> str | None:
-    """Share of the wall seen, in per cent, or the seen area where the whole wall is unknown."""
+    """Share of the wall seen, in per cent, or the seen area where the whole wall is unknown; None without a surface."""
+    if not submap.counts:
+        return None
     return f"{100.0 * submap.figures['seen']:.0f} %" if "seen" in submap.figures else _area_of(submap, "seen_area")
 
 
@@ -357,7 +388,7 @@ def _stages(contents: Contents) -> Iterator[Block]:
             title = f"{title}: {'; '.join(filter(None, texts))}"
         rows = ([name, stage.summary, duration(stage.seconds)] for name, stage in of_segment.items())
         warnings = [
-            Bullet(warning, name, quote(next(iter(stage.files), "")))
+            Bullet(with_times(contents, warning), name, quote(next(iter(stage.files), "")))
             for name, stage in of_segment.items()
             for warning in stage.warnings
         ]
@@ -365,6 +396,6 @@ def _stages(contents: Contents) -> Iterator[Block]:
         table = simple_table(["stage", Column("result", words=True), "time"], rows)
         blocks: list[Block] = [table, *(Bullets(items) for items in (warnings, files) if items)]
         if of_segment or name:
-            yield Folded(title, blocks, is_open=not name)
+            yield Folded(title, blocks)
     if not segments:
         yield Paragraph("No stretch of this video is long enough for a segment.", hint=False)

@@ -52,6 +52,11 @@ OUTPUTS: dict[str, tuple[str, ...]] = {
 SHARED = ("survey", "frames", "poses", "joins")
 
 
+def submap_name(segment: str, number: int) -> str:
+    """Name of a sub-map on pages: ``sub-map 1``, or of a long video ``segment-003/1``."""
+    return f"{segment}/{number}" if segment else f"sub-map {number}"
+
+
 @dataclass(frozen=True)
 class StageRecord:
     """Result of a stage, and its state."""

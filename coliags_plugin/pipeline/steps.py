@@ -34,15 +34,19 @@ from coliags_plugin.engine.trainer import open_training
 from coliags_plugin.export.viewer.page import save_page
 from coliags_plugin.geometry.meshes.mesh import MESH_FORMATS, read_mesh
 from coliags_plugin.geometry.poses import colmap
+from coliags_plugin.pipeline.contents import read_contents
 from coliags_plugin.pipeline.frame_sources import Span, chosen_frames, frame_source
 from coliags_plugin.pipeline.frames import IMAGES, read_blurred, read_lens_mask, write_frames
 from coliags_plugin.pipeline.settings import FEWEST, ReconstructionSettings
-from coliags_plugin.pipeline.stages import Stage, StageRecord
+from coliags_plugin.pipeline.stages import Record, Stage, StageRecord, submap_name
 from coliags_plugin.pipeline.survey import SURVEY_FILE, Survey, Video, cut, survey_video
+from coliags_plugin.pipeline.timeline import with_times
+from coliags_plugin.pipeline.verdict import judge, measured_geometry
 from coliags_plugin.reconstruction.depth.scene import estimate_scene, training_options
 from coliags_plugin.reconstruction.structure import sfm
 from coliags_plugin.reconstruction.structure.colmap_scene import write_sfm_scene
 from coliags_plugin.reconstruction.structure.image_files import list_images
+from coliags_plugin.reporting.colormaps import depth_scale_text
 from coliags_plugin.reporting.html_page import write_html
 from coliags_plugin.reporting.image_files import eight_bit, write_png
 from coliags_plugin.reporting.numbers import area_text, counted
@@ -111,6 +115,12 @@ class StageContext:
         return "".join(f"{name}/" for name in (self.segment, self.submap and self.submap.folder) if name)
 
     @property
+    def title(self) -> str:
+        """Name of the scene on pages: the source, and which sub-map of it."""
+        number = None if self.submap is None else self.submap.number
+        return ", ".join([self.source.name, *([] if number is None else [submap_name(self.segment, number)])])
+
+    @property
     def places(self) -> list[Path]:
         """Files and folders that were given."""
         return [path for path in (self.source, self.mask) if path is not None]
@@ -153,7 +163,8 @@ class StageContext:
         options += [] if size is None else [f"width={size[0]}", f"height={size[1]}"]
         options += ["split=inner-8th"] if self.data_format is None else []
         scene = open_scene(self.posed, self.data_format or "colmap", options, self.progress, stored_size)
-        return scene if self.data_format is not None else scene.without(read_blurred(self.frames))
+        scene = scene if self.data_format is not None else scene.without(read_blurred(self.frames))
+        return replace(scene, name=self.title)
 
     @property
     def model_options(self) -> list[str]:
@@ -164,6 +175,11 @@ class StageContext:
     def scene(self) -> Path:
         """Scene to train on: that with estimated depth, or the source."""
         return self.folder / "depth" if self.estimates_depth else self.posed
+
+    def trained(self) -> TrainedRun:
+        """The trained run, its scene under the title of the sub-map."""
+        trained = load_trained(self.run, self.device, self.scene)
+        return replace(trained, scene=replace(trained.scene, name=self.title))
 
     @cached_property
     def estimates_depth(self) -> bool:
@@ -201,6 +217,7 @@ def stages_of(context: StageContext) -> list[Stage]:
         stage("train", train, method=settings.method, steps=steps_for(context), seed=settings.seed),
         stage("evaluate", evaluate),
         stage("mesh", mesh, mesh=settings.mesh.model_dump()),
+        stage("verdict", judge_geometry),
         stage("coverage", coverage, coverage=settings.coverage.model_dump()),
         stage("scene", show),
         stage("report", report),
@@ -306,11 +323,11 @@ def check_data(context: StageContext) -> StageRecord:
 
 def estimate_depth(context: StageContext) -> StageRecord:
     """Estimate dense depth with its confidence; goes on where a kill has left it."""
-    summary, warnings = estimate_scene(
+    summary, warnings, confident = estimate_scene(
         context.open_posed(), context.scene, context.settings.depth, overwrite=True, progress=context.progress
     )
     files = {"depth": "scene in nerfstudio's layout: images, poses, depth, confidence, points"}
-    return StageRecord(summary, files, warnings)
+    return StageRecord(summary, files, warnings, {"confident": confident})
 
 
 def steps_for(context: StageContext) -> int:
@@ -354,16 +371,18 @@ def train(context: StageContext) -> StageRecord:
 
 def evaluate(context: StageContext) -> StageRecord:
     """Evaluate the held-out frames."""
-    trained = load_trained(context.run, context.device, context.scene)
+    trained = context.trained()
     result = evaluator.evaluate(trained, trained.config.protocol, refine_poses=True)
     folder = trained.run.evaluations / result.evaluation_name
     figures = {name: result.sets[result.main_set].mean(name) for name in ("psnr", "ssim", "psnr_pose_refined")}
     figures = {name: value for name, value in figures.items() if value is not None}
     shown = ", ".join(f"{name.upper()} {figures[name]:.4g}" for name in ("psnr", "ssim") if name in figures)
     files = {str(folder.relative_to(context.folder)): "metrics and rendered frames"}
-    figures |= {"held_out": sum(len(frames) for frames in trained.scene.test_sets.values())}
+    figures |= {"held_out": sum(len(frames) for frames in trained.scene.test_sets.values()), **_training_psnr(trained)}
+    differences = {"gap": "psnr_training", "pose_gain": "psnr_pose_refined"}
+    figures |= {name: figures[other] - figures["psnr"] for name, other in differences.items() if other in figures}
     warnings = [f"held-out frames: {part.transparency_warning}" for part in result.sets.values() if part.blank]
-    return StageRecord(f"held-out frames: {shown}", files, warnings, figures=figures | _training_psnr(trained))
+    return StageRecord(f"held-out frames: {shown}", files, warnings, figures=figures)
 
 
 def _training_psnr(trained: TrainedRun) -> dict[str, float]:
@@ -378,7 +397,7 @@ def _training_psnr(trained: TrainedRun) -> dict[str, float]:
 
 def mesh(context: StageContext) -> StageRecord:
     """Fuse the rendered depth into a mesh."""
-    trained = load_trained(context.run, context.device, context.scene)
+    trained = context.trained()
     fused = mesh_run(trained, context.run / "mesh", context.settings.mesh, overwrite=True)
     area = fused.mesh.areas.sum()
     shown = area_text(area, trained.scene.is_metric)
@@ -387,8 +406,23 @@ def mesh(context: StageContext) -> StageRecord:
     return StageRecord(f"{len(fused.mesh):,} triangles, {shown}", files, figures=figures)
 
 
+def judge_geometry(context: StageContext) -> StageRecord:
+    """Judge the geometry by what earlier stages have measured, the agreement of views, and the parts of the mesh."""
+    stages = Record.of(context.root).stages
+    before = (
+        stages[context.prefix + step] for step in ("check", "depth", "evaluate") if context.prefix + step in stages
+    )
+    figures = {name: value for stage in before for name, value in stage.figures.items()}
+    geometry = measured_geometry(context.trained(), read_mesh(context.run / "mesh" / "mesh.ply"))
+    word, reasons = judge(figures | geometry)
+    summary = word if word == "usable" else f"{word}: {'; '.join(reasons)}"
+    return StageRecord(summary, figures=geometry | {"verdict": word, "reasons": reasons})
+
+
 def coverage(context: StageContext) -> StageRecord:
-    """Measure the share of the wall seen in the video; left out where it cannot be measured."""
+    """Measure the share of the wall seen in the video; left out where it cannot be measured, or is no surface."""
+    if Record.of(context.root).stages[f"{context.prefix}verdict"].figures.get("verdict") == "not usable":
+        return StageRecord("left out: the geometry is not usable")
     wall, folder = read_mesh(context.run / "mesh" / "mesh.ply"), context.run / "coverage"
     try:
         measured = measure_scene(context.open_posed(), wall, folder, context.settings.coverage, overwrite=True)
@@ -396,7 +430,7 @@ def coverage(context: StageContext) -> StageRecord:
         raise
     except InputError as error:
         return StageRecord(f"left out: {error}", warnings=[f"no coverage: {error}"])
-    what = "what was seen and missed, for research use only"
+    what = "what was seen and missed"
     values = measured.values
     return StageRecord(
         "; ".join(f"{fact.name}: {fact.text}" for fact in measured.facts),
@@ -407,10 +441,11 @@ def coverage(context: StageContext) -> StageRecord:
 
 def show(context: StageContext) -> StageRecord:
     """Write the page of Gaussians and meshes along the path of the video, and pictures of some of its frames."""
-    trained = load_trained(context.run, context.device, context.scene)
+    trained = context.trained()
     depth_scale = _write_pictures(trained, context.run / "pictures")
     size, steps = _PAGES[context.folder == context.out], min(trained.step, _MOST_FIT_STEPS)
-    page = save_page(trained, PageOptions(size=size, seconds=math.inf), steps)
+    label = partial(with_times, read_contents(context.root))
+    page = save_page(trained, PageOptions(size=size, seconds=math.inf), steps, label)
     what = "the scene to fly through: Gaussians, surface, coverage"
     files = {"run/scene.html": what, "run/pictures": "frames, depth, flattened light"}
     return StageRecord(page.text, files, figures={"depth_scale": depth_scale})
@@ -425,7 +460,7 @@ def _write_pictures(trained: TrainedRun, folder: Path) -> str:
     depth, video, scale = "depth_expected", trained.scene.video, ""
     if depth in trained.model.outputs:
         limits = sampled_depth_limits(trained, video, depth)
-        scale = f"expected depth, {limits[0]:g} to {limits[1]:g} {trained.scene.length_unit}"
+        scale = depth_scale_text(limits, trained.scene.length_unit)
     for index in evenly(len(video), _PICTURED):
         frame = video[index]
         write_png(folder / frame.name / "recorded.png", frame.image)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
@@ -14,7 +15,7 @@ import numpy as np
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import read_rgb
-from coliags_plugin.pipeline.contents import Contents
+from coliags_plugin.pipeline.contents import FRAME_NAME, Contents
 from coliags_plugin.pipeline.frames import IMAGES, THINNED
 from coliags_plugin.reporting.html_page import COLORS
 from coliags_plugin.reporting.image_files import EncodedImage
@@ -25,6 +26,8 @@ from coliags_plugin.reporting.numbers import linear_ticks, tick_label
 _COLUMNS, _BINS, _PICTURES = 2000, 600, 24
 #: Width of a picture, pixels.
 _WIDTH = 144
+#: Width of a letter on the ribbon of a wide page, per cent of it.
+_LETTER = 0.7
 #: Steps of the time axis, seconds, and most of its ticks.
 _STEPS, _TICKS = (1, 2, 5, 10, 20, 30, 60, 120, 300, 600, 1200, 1800, 3600, 7200), 9
 #: Percentile of a curve at which its axis ends.
@@ -100,6 +103,16 @@ def span_text(contents: Contents, first: int, last: int) -> str:
     return ", ".join(filter(None, (frames, clock_span(contents, first, last))))
 
 
+def with_times(contents: Contents, text: str) -> str:
+    """A text with the names of frames of a video, ``frame_000030``, as numbers and times: ``frame 30 (0:01)``."""
+
+    def numbered(name: re.Match[str]) -> str:
+        time = clock(contents, int(name[1]))
+        return f"frame {int(name[1])}{f' ({time})' if time else ''}"
+
+    return FRAME_NAME.sub(numbered, text)
+
+
 def picture_near(contents: Contents, first: int, last: int) -> EncodedImage | None:
     """The frame of use nearest to the middle of a stretch, as a small JPEG; None without one that can be read."""
     middle = (first + last) / 2
@@ -127,7 +140,10 @@ def timeline(contents: Contents, states: Sequence[State]) -> Template:
     ribbon, first = list[dict[str, Any]](), video.first
     for state, run in groupby(_in_columns(states)):
         stop = first + sum(1 for _ in run)
-        ribbon.append({**bar(first, stop - 1, state.what, state.why), "style": state.style})
+        values = bar(first, stop - 1, state.what, state.why)
+        name = "" if state.style is None else state.what.removeprefix("sub-map ").removeprefix("segment-")
+        has_room = values["width"] >= _LETTER * len(name)
+        ribbon.append({**values, "style": state.style, "name": name if has_room else ""})
         first = stop
     segments = [
         {

@@ -15,7 +15,7 @@ from tests.pipeline.reconstructions import write_atlas, write_long, write_short
 from tests.task_list import TaskList
 
 CAPTURE = ("make_poses", "check_data", "estimate_depth")
-TRAINING = ("train", "evaluate", "mesh", "coverage", "show", "report")
+TRAINING = ("train", "evaluate", "mesh", "judge_geometry", "coverage", "show", "report")
 
 
 class Killed(BaseException):

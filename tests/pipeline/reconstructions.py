@@ -48,6 +48,11 @@ def done(files=(), warnings=(), **figures):
     return StageRecord("well", dict(files), warnings, figures, seconds=60.0)
 
 
+def judged(verdict: str, *reasons: str) -> StageRecord:
+    """The stage of the verdict."""
+    return StageRecord(": ".join((verdict, *reasons)), figures={"verdict": verdict, "reasons": reasons})
+
+
 def similarity(seed: int) -> np.ndarray:
     """A rotation, scale and shift. [4, 4]"""
     drawn = np.random.default_rng(seed)
@@ -139,15 +144,17 @@ def write_segment(folder: Path, first: int = 0) -> dict[str, StageRecord]:
         "poses": done({"poses": "scene"}),
         "check": done({"check.html": "check"}, ["suspect: the camera jumps. Check it"], frames=14),
         "train": done(steps=2000),
-        "evaluate": done({"run/eval/paper": "metrics"}, psnr=24.0, ssim=0.85, held_out=2, psnr_training=27.5),
+        "evaluate": done({"run/eval/paper": "metrics"}, psnr=24.0, ssim=0.85, held_out=2, psnr_training=27.5, gap=3.5),
         "mesh": done(area=4200.0, unit="mm"),
+        "verdict": judged("usable"),
         "scene": done({SCENE_FILE: "scene", FOLDER: "pictures"}),
         "coverage": done(seen=0.625),
         "report": done(),
         "submap-1/check": done({"submap-1/check.html": "check"}, frames=12),
         "submap-1/train": done(steps=500),
-        "submap-1/evaluate": done(psnr=22.0, ssim=0.8, held_out=2, psnr_training=23.5, psnr_pose_refined=23.0),
+        "submap-1/evaluate": done(psnr=22.0, ssim=0.8, held_out=2, psnr_training=23.5, gap=1.5, psnr_pose_refined=23.0),
         "submap-1/mesh": done(area=900.0, unit="units"),
+        "submap-1/verdict": judged("doubtful", "15 % of the pixels have confident depth"),
         "submap-1/scene": done({f"submap-1/{SCENE_FILE}": "scene"}),
         "submap-1/coverage": done(seen_area=800.0),
         "submap-2/check": done(frames=5),

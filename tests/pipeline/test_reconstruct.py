@@ -8,27 +8,31 @@ import logging
 import re
 import shutil
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
 
 import coliags_plugin as cp
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import not_writable
 from coliags_plugin.core.images import write_image
+from coliags_plugin.core.render_output import RenderOutput
 from coliags_plugin.core.scene_files import read_unit
 from coliags_plugin.engine.data_formats import find_format
 from coliags_plugin.export.baking import distillation
 from coliags_plugin.geometry.lenses.models import LENSES
-from coliags_plugin.geometry.meshes.mesh import read_mesh
+from coliags_plugin.geometry.meshes.mesh import TriangleMesh, read_mesh
 from coliags_plugin.geometry.poses import colmap
 from coliags_plugin.geometry.poses.alignment import align, associate
 from coliags_plugin.geometry.poses.trajectory import Trajectory
-from coliags_plugin.pipeline import steps
+from coliags_plugin.pipeline import steps, verdict
 from coliags_plugin.pipeline.frame_sources import opened_recording
 from coliags_plugin.pipeline.reconstruct import forecast
 from coliags_plugin.pipeline.settings import ReconstructionSettings
 from coliags_plugin.pipeline.steps import identity_of
+from coliags_plugin.pipeline.verdict import LIMITS, VERDICTS, judge, measured_geometry
 from coliags_plugin.reconstruction.structure.sfm_settings import CameraSettings, SfmSettings, Start, starting_cameras
 from coliags_plugin.reporting.video import write_video
 from coliags_plugin.results.reading import read_result
@@ -36,6 +40,7 @@ from tests import commands
 from tests.layouts import calibration_text
 from tests.pipeline.conftest import CAPTURE, TRAINING, Killed
 from tests.pipeline.films import HEIGHT, WIDTH, film, write_film, write_images
+from tests.pipeline.reconstructions import judged
 from tests.textured_tube import INTRINSICS, tube_frames, write_tube
 
 _COVERAGE = steps.coverage
@@ -125,6 +130,62 @@ def test_coverage_is_left_out_where_it_cannot_be_measured_but_not_where_it_canno
     failing(InputError("too few triangles"))
     cp.reconstruct(scene, tmp_path / "out")
     assert "no coverage: too few triangles" in caplog.text
+
+
+@pytest.mark.parametrize("name", LIMITS)
+def test_every_figure_can_give_each_verdict(name):
+    limit = LIMITS[name]
+    beyond = 1.01 * limit.not_usable if limit.not_usable > limit.doubtful else 0.99 * limit.not_usable
+    between = 0.5 * (limit.doubtful + limit.not_usable)
+    good = limit.doubtful + (limit.doubtful - limit.not_usable)
+    for value, word in zip((max(good, 0.0), between, beyond), VERDICTS, strict=True):
+        judged_word, reasons = judge({name: value})
+        assert judged_word == word and len(reasons) == (word != "usable")
+    assert judge({name: limit.doubtful})[0] == "doubtful" and judge({name: limit.not_usable})[0] == "not usable"
+
+
+def test_the_worst_figure_gives_the_verdict_and_reasons_come_in_its_order():
+    good = {"frames": 99, "gap": 0.5, "confident": 0.8, "contradicted": 0.0, "largest_part": 1.0, "psnr": 1.0}
+    assert judge(good) == judge({}) == ("usable", [])
+    gap, parts = (
+        "held-out views are 6.0 dB worse than training views",
+        "the largest piece of the mesh has 20 % of its area",
+    )
+    assert judge({**good, "gap": 6.0}) == ("doubtful", [gap])
+    assert judge({**good, "gap": 6.0, "largest_part": 0.2}) == ("not usable", [parts, gap])
+
+
+@pytest.mark.parametrize(("factors", "expected"), [((1.0, 1.0), 0.0), ((1.0, 1.04), 0.0), ((1.0, 1.06), 1.0)])
+def test_views_of_one_wall_agree_and_those_of_walls_apart_do_not(monkeypatch, factors, expected):
+    """A tube whose depth every other view sees as larger by a factor; pieces of three and one unit of area."""
+    frames = tube_frames(8, 2.0)
+    depths = {frame.name: frame.depth * factors[index % 2] for index, frame in enumerate(frames)}
+    monkeypatch.setattr(
+        verdict,
+        "render_view",
+        lambda trained, frame, wants: RenderOutput(
+            torch.zeros(*frame.depth.shape, 3),
+            torch.ones_like(frame.depth),
+            frame.camera,
+            {"depth_accumulated": depths[frame.name]},
+        ),
+    )
+    corners = np.array([[0, 0, 0], [6, 0, 0], [0, 1, 0], [9, 9, 9], [9, 11, 9], [9, 9, 10]], np.float32)
+    mesh = TriangleMesh(corners, np.arange(6).reshape(2, 3))
+    figures = measured_geometry(SimpleNamespace(scene=SimpleNamespace(train=frames)), mesh)
+    assert (figures["parts"], figures["largest_part"]) == (2, 0.75)
+    assert figures["covered"] == 0.0
+    # Others of the same factor do not contradict, and the ends of the tube are out of each other's sight.
+    assert 0.45 * expected <= figures["contradicted"] <= 0.65 * expected
+
+
+def test_the_coverage_of_what_is_not_usable_is_not_measured(calls, tmp_path, monkeypatch):
+    monkeypatch.setattr(steps, "coverage", _COVERAGE)
+    monkeypatch.setattr(steps, "judge_geometry", lambda context: judged("not usable", "only 5 frames"))
+    record = cp.reconstruct(write_tube(tmp_path / "tube", 6, 3.0), tmp_path / "out")
+    assert record.stages["coverage"].summary == "left out: the geometry is not usable"
+    assert not record.stages["coverage"].figures and record.stages["verdict"].figures["verdict"] == "not usable"
+    assert "not usable: only 5 frames" in (tmp_path / "out" / "index.html").read_text()
 
 
 def test_bad_input_leaves_nothing(tmp_path, capsys):

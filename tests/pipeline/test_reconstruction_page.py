@@ -14,10 +14,10 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import write_json
 from coliags_plugin.pipeline import page
 from coliags_plugin.pipeline.contents import common_frames, read_contents
-from coliags_plugin.pipeline.page import held_out_text, submap_table, write_page
+from coliags_plugin.pipeline.page import held_out_text, submap_table, verdicts, write_page
 from coliags_plugin.pipeline.stages import Record
 from coliags_plugin.pipeline.survey import Survey
-from coliags_plugin.pipeline.timeline import clock, frame_states, timeline
+from coliags_plugin.pipeline.timeline import clock, frame_states, timeline, with_times
 from coliags_plugin.reporting.text_formats import terminal_text
 from tests.pipeline.reconstructions import (
     FAILURE,
@@ -27,6 +27,7 @@ from tests.pipeline.reconstructions import (
     change_video,
     done,
     join,
+    judged,
     similarity,
     span,
     video,
@@ -38,6 +39,10 @@ from tests.pipeline.reconstructions import (
 def page_of(out):
     write_page(out)
     return (out / "index.html").read_text(encoding="utf-8")
+
+
+def rows_of(table):
+    return [{column.key: cell.text for column, cell in zip(table.columns, row, strict=True)} for row in table.cells]
 
 
 def states_of(out):
@@ -91,12 +96,12 @@ def test_the_page_tells_what_came_out(out):
         "100 frames, 10.0 s, 40 x 32 px",
         "57 of 58 used (98 %)",
         "2 of 3 (1 failed or not finished)",
-        "4 reconstructed of 6 (2 failed)",
+        "2 usable, 2 doubtful, 2 failed",
         "1 of 2 places between segments",
-        "23.00 dB in the mean over 4 sub-maps, 22.00 to 24.00",
-        "84.0 cm² (of 2 sub-maps with lengths in mm)",
-        "62 % in the mean over 2 sub-maps",
-        "mm of 2 of 6 sub-maps",
+        "23.00 dB in the mean over 4 sub-maps, usable or doubtful, 22.00 to 24.00",
+        "84.0 cm² (of 2 sub-maps, usable or doubtful, with lengths in mm)",
+        "62 % in the mean over 2 sub-maps, usable or doubtful",
+        "mm of 2 of 4 sub-maps (the colon&#39;s inner diameter gives mm: <code>coliags reconstruct VIDEO ",
     ):
         assert fact in text
     assert f"segment-002/poses failed: {FAILURE}" in text
@@ -132,25 +137,26 @@ def test_a_short_video_is_a_long_one_of_one_segment(out, short):
     long, text = page_of(out), page_of(short)
     heads = re.findall(r"<h2>([^<]*)", text)
     assert heads == re.findall(r"<h2>([^<]*)", long)
-    assert heads[:4] == ["Time line", "Scenes", "Depth and light", "Held-out views"]
-    assert heads[4:] == ["Sub-maps", "Frames without a pose", "Stages and files"]
+    assert heads[:4] == ["Time line", "Sub-maps", "Scenes", "Depth and light"]
+    assert heads[4:] == ["Held-out views", "Frames without a pose", "Stages and files"]
     assert long.count('class="curve"') == 3 and 'class="curve"' not in text, "of the survey, which one has"
     assert 'href="frames/images"' in text and "the poses of sub-map 0 (well): there the surface may be bent" in text
-    assert "31 of 32 used (97 %)" in text and "2 reconstructed of 3 (1 failed)" in text
+    assert "31 of 32 used (97 %)" in text and "1 usable, 1 doubtful, 1 failed" in text
 
 
 def test_the_page_of_a_scene_with_poses_does_without_frames(tmp_path):
     Record(tmp_path, {"check": done({"check.html": "check"}, frames=14), "train": done()}).write()
     text = page_of(tmp_path)
     assert "Frames with a pose" not in text and "Time line" not in text and "sub-map 1" not in text
-    assert "<iframe" not in text and "1 reconstructed of 1" in text
+    assert "<iframe" not in text and "1 not judged yet" in text
 
 
 def test_figures_of_sub_maps_and_their_means(short):
     submaps = read_contents(short).submaps
     table = submap_table(read_contents(short))
-    rows = [{column.key: cell.text for column, cell in zip(table.columns, row, strict=True)} for row in table.cells]
+    rows = rows_of(table)
     assert [row["submap"] for row in rows] == ["sub-map 0", "sub-map 1", "sub-map 2", "mean"]
+    assert [row["verdict"] for row in rows] == ["usable", "doubtful", "", ""]
     assert [row["psnr"] for row in rows] == ["24.00", "22.00", "", "23.00"]
     assert [row["gap"] for row in rows] == ["3.50", "1.50", "", "2.50"]
     assert [row["psnr_pose_refined"] for row in rows] == ["", "23.00", "", "23.00"]
@@ -158,18 +164,43 @@ def test_figures_of_sub_maps_and_their_means(short):
     assert [row["seen"] for row in rows] == ["62 %", "800 square units", "", ""]
     assert [row["steps"] for row in rows] == ["2000", "500", "", ""]
     assert rows[0]["span"] == "0 to 13, 0:00 to 0:01"
-    assert held_out_text(submaps) == "23.00 dB in the mean over 2 sub-maps, 22.00 to 24.00"
+    assert held_out_text(submaps) == "23.00 dB in the mean over 2 sub-maps, usable or doubtful, 22.00 to 24.00"
     assert (held_out_text(submaps[:1]), held_out_text(submaps[2:])) == ("24.00 dB", "")
-    assert "depth failed: no surface that 5 frames agree on" in terminal_text([table])
+    assert "depth failed: no surface that 5 frames agree on" in terminal_text([verdicts(read_contents(short))])
     record = Record.of(short)
     record.forget([name for name in record.of_submaps("") if not name.startswith("submap-2/")])
     alone = submap_table(read_contents(short))
     assert not {"seen", "psnr_pose_refined"} & {column.key for column in alone.columns}
 
 
+def test_what_is_not_usable_is_in_no_headline_and_its_wall_is_not_called_seen(out):
+    record = Record.of(out)
+    why = "the largest piece of the mesh has 9 % of its area"
+    record.stages |= {f"segment-00{k}/verdict": judged("not usable", why) for k in (0, 1)}
+    record.write()
+    contents, text = read_contents(out), page_of(out)
+    for fact in ("2 doubtful, 2 not usable, 2 failed", "22.00 dB in the mean over 2 sub-maps, usable or doubtful"):
+        assert fact in text
+    assert text.index(f"not usable: {why}") < text.index('data-name="submaps"') < text.index("<iframe")
+    assert "Wall seen" not in text and "62 %" not in text and ">Area</dt>" not in text
+    rows = {row["submap"]: (row["psnr"], row["seen"]) for row in rows_of(submap_table(contents))}
+    assert rows["segment-000/0"] == ("24.00", "") and rows["segment-000/1"] == ("22.00", "800 square units")
+    assert rows["mean"] == ("22.00", "")
+
+
+def test_names_of_frames_get_numbers_and_times(out):
+    contents, names = read_contents(out), "at frame_000000, frame_000057 and 003.png"
+    assert with_times(contents, names) == "at frame 0 (0:00), frame 57 (0:05) and 003.png"
+    change_video(out, rate=None)
+    (out / "survey.npz").unlink()
+    assert with_times(read_contents(out), names) == "at frame 0, frame 57 and 003.png"
+
+
 def test_the_time_line_has_one_axis(out):
     values = timeline(read_contents(out), frame_states(read_contents(out))).values
     assert sum(bar["width"] for bar in values["ribbon"]) == pytest.approx(100.0)
+    named = [bar["name"] for bar in values["ribbon"]]
+    assert named == ["000/0", "000/1", "000/2", "001/0", "001/1", "001/2", "", "", "", ""]
     assert [bar["left"] for row in values["rows"] for bar in row] == [0.0, 70.0, 26.0]
     assert len(values["thumbs"]) == 24 and sum(thumb["image"] is not None for thumb in values["thumbs"]) == 14
     assert [curve["top"] for curve in values["curves"]] == ["0.02", "100", "1"]

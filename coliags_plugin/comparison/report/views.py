@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -157,8 +157,8 @@ def _reduction(width: int) -> int:
     return math.ceil(width / _WIDEST)
 
 
-def view_section(study: Study, reference: str, count: int) -> Section:
-    """Section of held-out views; says so where there are no images."""
+def view_section(study: Study, reference: str, count: int, label: Callable[[str], str] = "frame {}".format) -> Section:
+    """Section of held-out views; says so where there are no images. ``label`` gives titles to names of frames."""
     if count < 1:
         raise InputError(f"{count} frames to show", "at least one")
     title, views = "Held-out views", list[_View]()
@@ -191,7 +191,7 @@ def view_section(study: Study, reference: str, count: int) -> Section:
                 scene,
                 depth_bars.get(scene),
                 [
-                    (test_set.title, [_template_values(view, error_ends, limits_of.get(scene)) for view in same])
+                    (test_set.title, [_template_values(view, error_ends, limits_of.get(scene), label) for view in same])
                     for test_set, same in grouped(in_scene, lambda view: view.frame.test_set).items()
                 ],
             )
@@ -232,10 +232,10 @@ def _depth_limits(views: Sequence[_View]) -> dict[str, tuple[float, float]]:
 
 
 def _template_values(
-    view: _View, error_ends: Mapping[str, float], limits: tuple[float, float] | None
+    view: _View, error_ends: Mapping[str, float], limits: tuple[float, float] | None, label: Callable[[str], str]
 ) -> dict[str, Any]:
     """Values of a view for the template."""
-    frame, where = view.frame, f"frame {view.frame.name}"
+    frame, where = view.frame, label(view.frame.name)
     study, test_set = frame.test_set.study, frame.test_set
     truth = EncodedImage.jpeg(view.truth)
     tiles: list[_Tile] = [(truth, f"{where}, true image")]
@@ -260,7 +260,7 @@ def _template_values(
         cells.append((name, study.methods.index(name), tiles, _caption(frame, rendering.run)))
     count = f"{frame.position + 1} of {len(test_set.frames(frame.scene))}"
     return {
-        "title": f"{frame.scene} · {test_set.set_name} · {frame.name}",
+        "title": f"{frame.scene} · {test_set.set_name} · {where}",
         "where": where,
         "count": f"{count} · {frame.why}" if frame.why else count,
         "size": truth,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -47,8 +48,6 @@ _SQUARED, _DEPTH = 200.0, 0.004
 _SHIFT, _TURN = 0.3, 0.03
 #: Training views, at most, that Gaussians are compared on; and how much larger their squared error may be: 0.2 dB.
 _COMPARED, _MUCH = 8, 1.047
-#: How much larger this error may be, as a multiple of the run's, where a view starts than where it is least: 1 dB.
-_NEARLY = 1.26
 #: Memory for targets.
 _TARGET_BYTES = 1 << 30
 _WANTS = ("rgb", "alpha", "depth_accumulated")
@@ -146,13 +145,12 @@ def needs_distillation(field: ExplicitGaussians, trained: TrainedRun, light: Hel
 def best_frame(field: ExplicitGaussians, trained: TrainedRun, light: HeldLight | None) -> int:
     """Index of the training frame, of some, that a view of Gaussians starts at.
 
-    Of the frames that they show nearly as well as the best one in comparison with the run, it is the one with the
-    largest median depth: not of a wall close to the lens, but along the lumen.
+    Of the half of the frames with the larger median depths, which look along the lumen and not at a wall close to the
+    lens, it is the one that they show best.
     """
     every = -(-len(trained.scene.train) // (2 * _COMPARED))
-    run_errors, errors, depths = _compared(field, trained, light, trained.scene.train[::every]).unbind(1)
-    losses = errors / run_errors.clamp_min(1e-12)
-    return every * int(depths.where(losses <= _NEARLY * losses.min(), -1.0).argmax())
+    _, errors, depths = _compared(field, trained, light, trained.scene.train[::every]).unbind(1)
+    return every * int(errors.where(depths >= depths.median(), math.inf).argmin())
 
 
 @torch.no_grad()

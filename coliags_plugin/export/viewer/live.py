@@ -233,7 +233,7 @@ class Viewer(Follower):
         server.scene.configure_default_lights(enabled=False)
         server.scene.configure_environment_map(hdri=None)
         server.scene.add_light_ambient("/light", intensity=3.0)
-        server.gui.set_panel_label(f"{self.trained.method} on {self.trained.scene.name}")
+        server.gui.set_panel_label(f"{self.trained.scene.name} ({self.trained.method})")
         server.gui.configure_theme(control_width="large", show_logo=False, show_share_button=False)
 
     def _connected(self, client: Any) -> None:

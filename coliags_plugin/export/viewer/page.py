@@ -7,7 +7,7 @@ import math
 import tempfile
 import zlib
 from base64 import b64encode
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -106,18 +106,21 @@ class Layer:
         return cls(name, about, packed)
 
 
-def packed_path(frames: Sequence[Frame], cameras: Sequence[Camera], training: Collection[str]) -> dict[str, Any]:
+def packed_path(
+    frames: Sequence[Frame], cameras: Sequence[Camera], training: Collection[str], label: Callable[[str], str] = str
+) -> dict[str, Any]:
     """JSON values of a video that a page follows: intrinsics, and frames with pictures of at most 240, evenly spaced.
 
     Args:
         frames: The frames in their order.
         cameras: Camera of each; they share intrinsics.
         training: Names of the frames that were trained on.
+        label: What the page calls a frame of a name.
     """
     every = -(-len(frames) // _PICTURES)
     packed = [
         {
-            "name": frame.name,
+            "name": label(frame.name),
             "axes": camera.camera_to_world[:3, :3].tolist(),
             "center": camera.camera_to_world[:3, 3].tolist(),
             "held_out": frame.name not in training,
@@ -182,16 +185,23 @@ class ScenePage:
     facts: Mapping[str, Any]  # the figures
 
 
-def save_page(trained: TrainedRun, options: PageOptions, most_steps: int | None = None) -> ScenePage:
+def save_page(
+    trained: TrainedRun, options: PageOptions, most_steps: int | None = None, label: Callable[[str], str] = str
+) -> ScenePage:
     """Write :func:`scene_page` to a file, ``scene.html`` in the run folder by default; an existing one is replaced."""
     output = options.output or trained.run.path / "scene.html"
     refuse_folder(output)
-    page = scene_page(trained, options, most_steps)
+    page = scene_page(trained, options, most_steps, label)
     atomic_write(output, page.html)
     return page
 
 
-def scene_page(trained: TrainedRun, options: PageOptions | None = None, most_steps: int | None = None) -> ScenePage:
+def scene_page(
+    trained: TrainedRun,
+    options: PageOptions | None = None,
+    most_steps: int | None = None,
+    label: Callable[[str], str] = str,
+) -> ScenePage:
     """A run as an HTML page of at most so many bytes: its Gaussians, and the meshes in its folder.
 
     Gaussians are baked in a light, given by its name, as files are, with colours that do not depend on the direction,
@@ -204,7 +214,7 @@ def scene_page(trained: TrainedRun, options: PageOptions | None = None, most_ste
     options = options or PageOptions()
     meshes = [_mesh_layer(name, read_mesh(file)) for name, file in mesh_files(trained.run.path).items()]
     video = trained.scene.video
-    path = packed_path(video, [adjusted_camera(trained, frame) for frame in video], trained.training_frames)
+    path = packed_path(video, [adjusted_camera(trained, frame) for frame in video], trained.training_frames, label)
     if isinstance(trained.model.field, GaussianField):
         return _page_of_gaussians(trained, trained.model.field, path, meshes, options, most_steps)
     if not meshes:
@@ -265,7 +275,7 @@ def _html(
     frame, points = scene.train[first], scene.points.positions if splats is None else torch.as_tensor(splats.means)
     distance = look_distance(scene, frame.camera, points)
     blur = renderer.settings.eps2d if isinstance(renderer, SplattingRenderer) else 0.0
-    title, near = f"{trained.method} on {scene.name}", min(frame.camera.near_plane, 0.02 * distance)
+    title, near = f"{scene.name} ({trained.method})", min(frame.camera.near_plane, 0.02 * distance)
     return page_html(title, layers, path, scene.video.index(frame), distance, blur, near)
 
 

@@ -147,13 +147,17 @@ class TriangleMesh:
         """The mesh without parts, connected by vertices, whose area is below a share of that of the largest part."""
         if not len(self):
             return self
+        areas = np.bincount(self.parts, self.areas)
+        return self.part(areas[self.parts] >= share * areas.max())
+
+    @cached_property
+    def parts(self) -> Int[np.ndarray, "F"]:
+        """Part, connected by vertices, that each triangle belongs to. [F]"""
         first, second, third = self.triangles.T
         rows, columns = np.concatenate([first, second]), np.concatenate([second, third])
         count = len(self.vertices)
         graph = coo_array((np.ones(len(rows), np.int8), (rows, columns)), shape=(count, count))
-        parts = connected_components(graph, directed=False)[1][first]
-        areas = np.bincount(parts, self.areas)
-        return self.part(areas[parts] >= share * areas.max())
+        return np.asarray(connected_components(graph, directed=False)[1][first])
 
     def to_open3d(self) -> Any:
         """The mesh as an ``open3d.t.geometry.TriangleMesh``, for ray casting and measures."""

@@ -43,7 +43,7 @@ def estimate_scene(
     jobs: int | None = None,
     overwrite: bool = False,
     progress: Progress | None = None,
-) -> tuple[str, list[str]]:
+) -> tuple[str, list[str], float]:
     """Estimate the depth of a posed scene's video, and write it as a scene in nerfstudio's layout.
 
     The depth of training frames, the range and the points are made of training frames alone; that of a test frame of
@@ -51,8 +51,8 @@ def estimate_scene(
     is written, and the same request resumes from them.
 
     ``near_far`` is the depth range, scene units, which is found where it is None; ``prior`` a folder of depth maps in
-    place of the brightness; ``jobs`` the number of threads, one for each core by default. Returns a summary and
-    warnings: for each reason, which frames have confidence 0 throughout.
+    place of the brightness; ``jobs`` the number of threads, one for each core by default. Returns a summary, warnings
+    (for each reason, which frames have confidence 0 throughout), and the share of the pixels with known depth.
     """
     frames = scene.video
     trained = {frame.name for frame in scene.train}
@@ -86,8 +86,8 @@ def estimate_scene(
         estimation = Estimation(frames, sources, depth_prior, depth_range, settings, work, jobs, progress)
         estimation.run()
         with atomic_folder(out, overwrite) as folder:
-            summary, warnings = _write(scene, frames, estimation, folder, progress)
-    return summary, warnings
+            result = _write(scene, frames, estimation, folder, progress)
+    return result
 
 
 def training_options(scene: Scene) -> list[str]:
@@ -101,7 +101,7 @@ def training_options(scene: Scene) -> list[str]:
 
 def _write(
     scene: Scene, frames: Sequence[Frame], estimation: Estimation, folder: Path, progress: Progress | None
-) -> tuple[str, list[str]]:
+) -> tuple[str, list[str], float]:
     writer = EstimatedSceneWriter(folder, estimation.range.far / 65000.0)
     k = frames[0].camera
     typical = np.median([estimation.medians[index] for index in estimation.sources])
@@ -122,10 +122,11 @@ def _write(
         pixels += int(frame.valid.sum())
         confident += int((confidence >= _KNOWN).sum())
     positions, colors = voxels.points()
+    share = confident / max(pixels, 1)
     if not len(positions):
         raise InputError(
-            f"no surface that {len(frames)} frames agree on: {100.0 * confident / max(pixels, 1):.1f} % of the pixels "
-            f"have a confidence of {_KNOWN:g} or more",
+            f"no surface that {len(frames)} frames agree on: {100.0 * share:.1f} % of the pixels have a confidence of "
+            f"{_KNOWN:g} or more",
             "sharp frames of the same surface from different positions, with correct poses",
             "Check the poses (coliags data check), or the images: blurred or dark frames give no depth",
         )
@@ -134,13 +135,13 @@ def _write(
     has_own_split = scene.provenance.split_name == "own"
     writer.finish(positions, colors, train, (train, test) if has_own_split else None)
     write_unit(folder, scene.provenance.unit)
-    share = f"{100.0 * confident / max(pixels, 1):.0f} % of the pixels with a confidence of {_KNOWN:g} or more"
-    summary = f"{len(frames)} frames, {share}; {len(positions)} points"
+    known = f"{100.0 * share:.0f} % of the pixels with a confidence of {_KNOWN:g} or more"
+    summary = f"{len(frames)} frames, {known}; {len(positions)} points"
     warnings = [
         f"{len(names)} of {len(frames)} frames have depth of confidence 0, {reason}: {', '.join(names)}"
         for reason, names in distrusted.items()
     ]
-    return summary, warnings
+    return summary, warnings, share
 
 
 #: Least confidence of a pixel, and least number of frames that see a point's voxel.

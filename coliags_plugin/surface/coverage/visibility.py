@@ -306,8 +306,8 @@ class Level(IntEnum):
     SEEN_WELL = 3
 
 
-#: Labels and colours (RGB; told apart with any colour vision) of maps and meshes: by level, what was seen well first, and
-#: of what was neither seen nor reconstructed, where the place of the surface is a guess.
+#: Labels and colours (RGB; told apart with any colour vision) of maps and meshes: by level, what was seen well first,
+#: and of what was neither seen nor reconstructed, where the place of the surface is a guess.
 MAP_LEGEND = (
     ("seen well", (150, 200, 190)),
     ("seen only at a glance", (240, 200, 66)),

@@ -178,10 +178,9 @@ def coverage_page(
     settings = coverage.settings
     near = f" from at most {settings.far:g} mm" if np.isfinite(settings.far) else ""
     method = (
-        "Seen: one frame or more shows the surface. Seen well: "
-        f"{settings.glance_frames} frames or more show it{near}, in pixels of a grey value of {settings.dark:g} or more "
-        f"(of 1), at most {settings.grazing:g} degrees from its normal. At a glance: fewer frames do. Too dark or too "
-        "far: frames show it, but none so near and bright."
+        f"Seen: one frame or more shows the surface. Seen well: {settings.glance_frames} frames or more show it{near}, "
+        f"in pixels of a grey value of {settings.dark:g} or more (of 1), at most {settings.grazing:g} degrees from its "
+        "normal. At a glance: fewer frames do. Too dark or too far: frames show it, but none so near and bright."
     )
     if isinstance(coverage, PartialCoverage):
         note = (

@@ -24,12 +24,12 @@ from coliags_plugin.export.baking import distillation
 from coliags_plugin.export.baking.baking import GaussianAverages, SeenColors, bake, blending_weights, fit_harmonics
 from coliags_plugin.export.baking.distillation import beside
 from coliags_plugin.export.baking.exporting import export_cost
-from coliags_plugin.export.splats.cloud import SplatCloud, cloud_of_field, field_of_cloud
+from coliags_plugin.export.splats.cloud import cloud_of_field, field_of_cloud
 from coliags_plugin.export.splats.formats import read_splats, write_splats
 from coliags_plugin.fields.spherical_harmonics import basis, colors
 from coliags_plugin.renderers.torch_renderer import TorchRenderer, TorchRendererSettings
 from tests.commands import refused, run
-from tests.export.splats.clouds import PARTS, random_cloud
+from tests.export.splats.clouds import random_cloud
 from tests.scenes import camera_at
 
 
@@ -263,17 +263,16 @@ def test_distilled_colours_fall_with_the_distance_to_the_lamp(run_of, monkeypatc
     assert clouds[0].attenuation is None and np.median(clouds[1].attenuation[:, 1]) > 0.0
 
 
-def test_a_view_starts_where_the_wall_is_farthest_of_what_is_shown_well(run_of):
-    """Cameras come nearer to the wall; what stands before the first one only is behind the others."""
+def test_a_view_starts_where_it_is_shown_best_of_the_far_half(run_of, monkeypatch):
+    """Neither at a wall before the lens, shown best of all, nor where the run shows as little as the Gaussians."""
     trained = run_of("3dgs").load()
     cloud = cloud_of_field(trained.model.field)
-    assert distillation.best_frame(field_of_cloud(cloud), trained, None) == 0
-    before = trained.scene.train[0].camera.center.numpy().astype(np.float32) + np.float32([0.0, 0.0, 0.3])
-    first = cloud.part(np.arange(len(cloud)) == 0)
-    shape = {"means": before[None], "scales": np.full_like(first.scales, 0.1), "opacities": np.float32([0.9])}
-    blob = replace(first, **shape, harmonics=first.harmonics + np.float32(10.0))
-    both = SplatCloud(**{name: np.concatenate([getattr(cloud, name), getattr(blob, name)]) for name in PARTS})
-    assert distillation.best_frame(field_of_cloud(both), trained, None) == 1
+    shown = distillation._compared(field_of_cloud(cloud), trained, None, trained.scene.train)
+    assert shown[:, 2].diff().lt(0.0).all(), "cameras come nearer to the wall"
+    rows = {"bad in both": [0.5, 0.5, 40.0], "best": [0.01, 0.002, 30.0], "far": [0.01, 0.01, 50.0]}
+    rows |= {"contact": [1e-4, 1e-4, 4.0], "near": [1e-3, 1e-3, 9.0]}
+    monkeypatch.setattr(distillation, "_compared", lambda *_: torch.tensor([*rows.values()]))
+    assert distillation.best_frame(field_of_cloud(cloud), trained, None) == [*rows].index("best")
 
 
 def test_surfels_are_exported_thin_and_come_back_as_surfels(run_of, wall, tmp_path):

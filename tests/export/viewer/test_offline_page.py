@@ -233,7 +233,7 @@ def test_the_command_writes_a_page_that_needs_no_network(anchors, tmp_path, caps
     assert re.search(
         r"step 2; ([\d,]+) of \1 Gaussians; recorded light; \d+\.\d\d dB in that light on 2 held-out", summary
     )
-    assert "<title>coliags on wall</title>" in text
+    assert "<title>wall (coliags)</title>" in text
     assert 'id="scene">{"layers":[{"about":"step 2; ' in text
     assert not re.search(r"""(?:src|href)\s*=\s*["']?(?:https?:)?//""", text)
     assert not re.findall(r"https?://", text)
@@ -277,7 +277,7 @@ def test_a_report_embeds_a_scene(anchors, tmp_path):
     (page,) = cp.report(anchors, tmp_path / "report.html", scene=anchors)
     text = page.read_text(encoding="utf-8")
     (embedded,) = re.findall(r'<iframe title="coliags on wall, seed 0" [^>]*data-page="([^"]*)"', text)
-    assert 'id="scene"' in unescape(embedded) and "<title>coliags on wall</title>" in unescape(embedded)
+    assert 'id="scene"' in unescape(embedded) and "<title>wall (coliags)</title>" in unescape(embedded)
     (plain,) = cp.report(anchors, tmp_path / "plain.html")
     assert "<iframe" not in plain.read_text(encoding="utf-8")
 
