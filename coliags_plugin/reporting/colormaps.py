@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from coliags_plugin.reporting.image_files import as_array
-from coliags_plugin.reporting.numbers import linear_ticks, tick_label
+from coliags_plugin.reporting.numbers import linear_ticks, round_up, tick_label
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -26,6 +26,8 @@ ColorMap = Literal["depth", "error"]
 DEPTH_ERROR_LIMIT_MM = 2.0
 #: Full scale of RGB error maps, as a fraction of that of the colours.
 RGB_ERROR_LIMIT = 0.2
+#: Median errors that a scale of errors spans, and pixels of a map that enter the median.
+_MEDIAN_ERRORS, _SAMPLED = 8.0, 20_000
 #: Grey level of pixels of unknown depth.
 UNKNOWN_GREY = 128
 #: Grey levels of the hatching over error pixels without ground truth.
@@ -122,6 +124,17 @@ def rgb_error(
     """
     error: np.ndarray = np.abs(_unit_rgb(rendered) - _unit_rgb(true)).mean(axis=2)
     return error if valid is None else np.where(as_array(valid).astype(bool), error, np.nan)
+
+
+def error_limit(errors: Iterable[Float[np.ndarray, "H W"]]) -> float:
+    """End of the scale of some error maps, in their unit: eight times their median, rounded up to 1, 2 or 5 times 10^n.
+
+    So that errors of most pixels can be told from none. Those that are zero or not finite do not count.
+    """
+    samples = [error.ravel()[:: math.ceil(error.size / _SAMPLED) or 1] for error in errors]
+    pooled = np.concatenate([*samples, np.zeros(0)])
+    pooled = pooled[np.isfinite(pooled) & (pooled > 0.0)]
+    return round_up(_MEDIAN_ERRORS * float(np.median(pooled))) if pooled.size else 1.0
 
 
 def colorize_error(error: Float[np.ndarray, "H W"], limit: float) -> UInt8[np.ndarray, "H W 3"]:

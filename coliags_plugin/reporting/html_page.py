@@ -194,7 +194,13 @@ class Axes:
     top: ClassVar[int] = 12
     bottom: ClassVar[int] = 250
 
-    def __init__(self, series: Sequence[Series], log_y: bool = False, names: Sequence[str] | None = None) -> None:
+    def __init__(
+        self,
+        series: Sequence[Series],
+        log_y: bool = False,
+        names: Sequence[str] | None = None,
+        equal_scales: bool = False,
+    ) -> None:
         self._log_y, self._names = log_y, names
         xs, ys = zip(*(point for line in series for point in line.points(log_y) if point), strict=True)
         self._x_limits = (min(xs), max(xs)) if names is None else (-0.5, len(names) - 0.5)
@@ -208,6 +214,12 @@ class Axes:
         else:
             margin = 0.06 * (high - low) or max(abs(high), 1.0) * 0.05
             self._y_limits = low - margin, high + margin
+        if equal_scales:
+            sides = [(self._x_limits, self.right - self.left), (self._y_limits, self.bottom - self.top)]
+            unit = max((high - low) / length for (low, high), length in sides)
+            self._x_limits, self._y_limits = (
+                ((low + high - unit * length) / 2, (low + high + unit * length) / 2) for (low, high), length in sides
+            )
 
     def x(self, value: float) -> float:
         """Horizontal coordinate of a value."""
