@@ -22,6 +22,7 @@ from coliags_plugin.reporting.colormaps import (
     colorize_error,
     depth_error,
     depth_limits,
+    depth_scale_text,
 )
 from coliags_plugin.reporting.image_files import EncodedImage, as_array, eight_bit
 
@@ -60,8 +61,8 @@ class RenderedView:
     def images(self) -> dict[str, UInt8[np.ndarray, "H W 3"]]:
         """Truth, rendering, depths on one scale, and depth error as images, by captions. [H, W, 3] each"""
         depths = [self.depth] if self.true_depth is None else [self.depth, self.true_depth]
-        limits = depth_limits(depths, self.unit)
-        scale = f"0 to {limits[1]:g} {self.unit}"
+        limits = depth_limits(depths)
+        scale = depth_scale_text(limits, self.unit)
         shown = {} if self.true_rgb is None else {"truth": self.true_rgb}
         shown["rendered"] = self.rgb
         if self.true_depth is not None:

@@ -27,7 +27,7 @@ from coliags_plugin.reporting.colormaps import (
     color_bar,
     colorize_depth,
     colorize_error,
-    common_limits,
+    depth_limits,
     depth_error,
 )
 from coliags_plugin.reporting.image_files import eight_bit, read_depth_tiff, write_depth_tiff, write_png
@@ -119,7 +119,7 @@ def _write_depth_pictures(evaluation: Path, unit: str) -> None:
     files = sorted((evaluation / EXPECTED_DEPTH).glob("*/*.tiff"))
     if not files:
         return
-    limits = common_limits(read_depth_tiff(file) for file in files)
+    limits = depth_limits(read_depth_tiff(file) for file in files)
     for file in files:
         picture = evaluation / "depth_pictures" / file.parent.name / f"{file.stem}.png"
         write_png(picture, colorize_depth(read_depth_tiff(file), limits, hatched=True))

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import UInt8
+from jaxtyping import Float, UInt8
 from pydantic import Field, field_validator
 from torch import Tensor
 
@@ -34,7 +34,7 @@ from coliags_plugin.reporting.colormaps import (
     depth_limits,
     rgb_error,
 )
-from coliags_plugin.reporting.image_files import as_array, eight_bit, write_depth_tiff, write_png
+from coliags_plugin.reporting.image_files import eight_bit, write_depth_tiff, write_png
 from coliags_plugin.reporting.video import check_rate, write_video
 
 #: Outputs of a view unless others are asked for.
@@ -93,7 +93,7 @@ def sampled_depth_limits(trained: TrainedRun, views: Sequence[Frame | Camera], d
     """One scale for a kind of depth of all views, from that of four of them."""
     sample = views[:: max(1, len(views) // 4)][:4]
     rendered = (render_view(trained, view, ("rgb", "alpha", depth)) for view in sample)
-    return depth_limits([as_array(output[depth]) for output in rendered], trained.scene.length_unit)
+    return depth_limits(opaque_depth(output, depth) for output in rendered)
 
 
 def error_limit_of(trained: TrainedRun) -> float:
@@ -143,8 +143,12 @@ def _write_frame(
 
 def depth_picture(output: RenderOutput, depth: str, limits: tuple[float, float]) -> UInt8[np.ndarray, "H W 3"]:
     """A rendered depth in colours between two limits, hatched where alpha is below :data:`OPAQUE_ALPHA`."""
-    depths = torch.where(output.alpha >= OPAQUE_ALPHA, output[depth], torch.nan)
-    return colorize_depth(depths, limits, hatched=True)
+    return colorize_depth(opaque_depth(output, depth), limits, hatched=True)
+
+
+def opaque_depth(output: RenderOutput, depth: str) -> Float[Tensor, "H W"]:
+    """A rendered depth, NaN where alpha is below :data:`OPAQUE_ALPHA`. [H, W]"""
+    return torch.where(output.alpha >= OPAQUE_ALPHA, output[depth], torch.nan)
 
 
 def _film(

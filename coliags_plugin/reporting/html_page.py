@@ -21,7 +21,7 @@ from markupsafe import Markup, escape
 from coliags_plugin.core import __version__
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_write
-from coliags_plugin.reporting.colormaps import ColorMap, color_table
+from coliags_plugin.reporting.colormaps import ColorMap, color_table, scale_ticks
 from coliags_plugin.reporting.image_files import EncodedImage
 from coliags_plugin.reporting.model import Block, Figure, Page, Series
 from coliags_plugin.reporting.numbers import (
@@ -142,7 +142,7 @@ def environment(assets: Path) -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    functions = (color_stops, columns_of, enumerate, linear_ticks, sentence, style_classes, tick_label, unit_text)
+    functions = (color_stops, columns_of, enumerate, scale_ticks, sentence, style_classes, tick_label, unit_text)
     templates.filters["prose"] = prose
     templates.globals |= {"dash": DASH, "axes_of": Axes, **{function.__name__: function for function in functions}}
     return templates

@@ -18,7 +18,7 @@ from coliags_plugin.core.images import read_rgb
 from coliags_plugin.reporting.colormaps import (
     colorize_depth,
     colorize_error,
-    common_limits,
+    depth_limits,
     depth_error,
     error_limit,
     hatch,
@@ -199,7 +199,7 @@ def _set_values(views: Sequence[_View], index: int) -> dict[str, Any]:
         bars.append(ColorBar((0.0, end), of, "error", f"|{kind} error|", f"{kind}-error-scale-{index}"))
     depths = [view.true_depth for view in views if view.true_depth is not None]
     depths = depths or [each.expected for view in views for each in view.renderings if each.expected is not None]
-    limits = common_limits(depths)
+    limits = depth_limits(depths)
     if depths:
         bars.append(ColorBar(limits, unit, "depth", "depth", f"depth-scale-{index}"))
     return {
@@ -210,7 +210,7 @@ def _set_values(views: Sequence[_View], index: int) -> dict[str, Any]:
     }
 
 
-def _template_values(view: _View, error_end: float, depth_limits: tuple[float, float]) -> dict[str, Any]:
+def _template_values(view: _View, error_end: float, limits: tuple[float, float]) -> dict[str, Any]:
     """Values of a view for the template."""
     frame, where = view.frame, f"frame {view.frame.name}"
     study, test_set = frame.test_set.study, frame.test_set
@@ -218,7 +218,7 @@ def _template_values(view: _View, error_end: float, depth_limits: tuple[float, f
     tiles: list[_Tile] = [(truth, f"{where}, true image")]
     caption = []
     if view.true_depth is not None:
-        tiles.append((EncodedImage.webp(colorize_depth(view.true_depth, depth_limits)), f"{where}, true depth"))
+        tiles.append((EncodedImage.webp(colorize_depth(view.true_depth, limits)), f"{where}, true depth"))
         caption = ["image and true depth"]
     elif not view.in_row:
         tiles.append((None, "no true depth"))
@@ -232,7 +232,7 @@ def _template_values(view: _View, error_end: float, depth_limits: tuple[float, f
             drawn = colorize_error(rendering.error, error_end)
             tiles.append((EncodedImage.webp(drawn), f"{where}, absolute {view.kind} error of {name}"))
             if rendering.expected is not None:
-                drawn = colorize_depth(rendering.expected, depth_limits, hatched=True)
+                drawn = colorize_depth(rendering.expected, limits, hatched=True)
                 tiles.append((EncodedImage.webp(drawn), f"{where}, expected depth of {name}"))
         cells.append((name, study.methods.index(name), tiles, _caption(frame, rendering.run)))
     count = f"{frame.position + 1} of {len(test_set.frames(frame.scene))}"

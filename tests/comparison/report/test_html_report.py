@@ -6,6 +6,7 @@ import base64
 import csv
 import io
 import json
+import math
 import re
 import shutil
 from html.parser import HTMLParser
@@ -18,7 +19,7 @@ from coliags_plugin.comparison.report.report import write_report
 from coliags_plugin.comparison.report.views import error_limit, evenly
 from coliags_plugin.config.options import ReportOptions
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.reporting.colormaps import color_table, hatch
+from coliags_plugin.reporting.colormaps import color_table, depth_limits, hatch
 from coliags_plugin.reporting.image_files import EncodedImage, write_depth_tiff
 from tests.comparison.report.made import (
     FRAMES,
@@ -107,7 +108,7 @@ def test_one_file_that_needs_nothing_else(tmp_path, two_runs):
     html = (tmp_path / "out" / "report.html").read_text()
     assert html == (tmp_path / "again.html").read_text(), "the same runs give the same bytes"
     assert "@import" not in html and "import(" not in html and "fetch(" not in html
-    assert re.findall(r"url\((.*?)\)", html) == ["#depth-error-scale", "#depth-scale"]
+    assert re.findall(r"url\((.*?)\)", html) == ["#depth-error-scale", "#depth-scale-0"]
     assert "prefers-color-scheme: dark" in html
     style = html.split("<style>")[1].split("</style>")[0]
     used = {word for _, attributes in page.tags for word in (attributes.get("class") or "").split()}
@@ -176,12 +177,14 @@ def test_expected_depth_is_shown_and_hatched(tmp_path, with_truth):
     page = report(tmp_path, [run])
     shown = page.images("expected depth of coliags")
     assert len(shown) == 6
-    # The scale goes from 0 to the true depths' 60 mm, or without any to 40 mm.
-    color = color_table("depth")[round(40 / 60 * 255 if with_truth else 255)]
+    # The scale is that of the true depths, or without any of the expected ones, which are all alike.
+    true = np.linspace(20, 60, HEIGHT * WIDTH).reshape(HEIGHT, WIDTH)[1:]
+    low, high = depth_limits([true]) if with_truth else (40.0, 41.0)
+    color = color_table("depth")[round(math.log(40.0 / low) / math.log(high / low) * 255)]
     assert all(np.abs(image[5].astype(int) - color).max() <= 2 for image in shown)
     assert all((image[0] == hatch(HEIGHT, WIDTH)[0]).all() for image in shown)
     assert "no true depth" not in page.text  # as it is where true depth of other methods is compared
-    assert "depth [mm]" in page.words
+    assert re.search(rf" depth \[mm\] {low:g} [0-9. ]*{high:g} ", page.words)
 
 
 @pytest.mark.parametrize(
