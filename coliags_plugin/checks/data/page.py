@@ -14,12 +14,12 @@ from coliags_plugin.checks.data.hypotheses import LEAST_CONFIDENCE, warp_image
 from coliags_plugin.core.images import sizes_text
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.reporting import model
-from coliags_plugin.reporting.colormaps import RGB_ERROR_LIMIT, colorize_error, hatch, rgb_error
+from coliags_plugin.reporting.colormaps import colorize_error, hatch, rgb_error
 from coliags_plugin.reporting.image_files import EncodedImage, eight_bit
 from coliags_plugin.reporting.numbers import counted, sentence, short_number
 
-#: Number of pairs shown.
-_SHOWN = 3
+#: Number of pairs shown, and difference of the last colour, as a fraction of full scale.
+_SHOWN, _DIFFERENCE = 3, 0.2
 
 
 def check_page(check: SceneCheck) -> model.Page:
@@ -140,11 +140,11 @@ def _pair_images(source: Frame, target: Frame) -> model.Figures:
     """A frame, its neighbour warped into it by depth and poses, and their difference; hatched where there is none."""
     painted, shown = warp_image(source, target)
     warped = np.where(shown[..., None], eight_bit(painted), hatch(*shown.shape))
-    difference = colorize_error(rgb_error(painted.float(), target.rgb, shown), RGB_ERROR_LIMIT)
+    difference = colorize_error(rgb_error(painted.float(), target.rgb, shown), _DIFFERENCE)
     images: list[tuple[np.ndarray | torch.Tensor, str]] = [
         (target.image, target.name),
         (warped, f"{source.name} warped into it"),
-        (difference, f"difference, yellow from {RGB_ERROR_LIMIT:.0%} of full scale on"),
+        (difference, f"difference, yellow from {_DIFFERENCE:.0%} of full scale on"),
     ]
     return model.Figures([model.Image(EncodedImage.png(rgb), caption) for rgb, caption in images])
 

@@ -453,7 +453,7 @@ def cautions(study: Study) -> list[str]:
     sets = [(run, name, record) for run in study.runs for name, record in run.result.sets.items()]
     if warned := [each for each in sets if each[-1].transparency_warning]:
         run, name, worst = max(warned, key=lambda each: (each[-1].blank, each[-1].transparent or 0.0))
-        others = f" Less so in {counted(len(warned) - 1, 'more set')} of views." if len(warned) > 1 else ""
+        others = f" At most as many in {counted(len(warned) - 1, 'more set')} of views." if len(warned) > 1 else ""
         texts.append(f"{run.method} on {run.scene}, set {name}: {worst.transparency_warning}.{others}")
     for run in study.runs:
         uses = held_out_uses(run.result.provenance.get("held_out_used", {}))

@@ -18,8 +18,8 @@ from coliags_plugin.core.images import read_rgb
 from coliags_plugin.reporting.colormaps import (
     colorize_depth,
     colorize_error,
-    depth_limits,
     depth_error,
+    depth_limits,
     error_limit,
     hatch,
     rgb_error,
@@ -173,7 +173,7 @@ def view_section(study: Study, reference: str, count: int) -> Section:
     explanation = (
         f"Frames spread along each video, and the worst of {reference}. Below each rendering is its absolute error, of "
         "depth, or without true depth of colour (the mean of red, green and blue), then its expected depth. The scales "
-        "of a set are the same for all methods and frames."
+        "of a set are the same for all its methods and frames: of errors by square roots, of depth logarithmic."
     )
     if len({run.result.seed for run in study.runs}) > 1:
         explanation += " Of several seeds, the first is shown."
