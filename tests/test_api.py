@@ -284,10 +284,9 @@ def test_what_fails_is_in_the_table(wall, tmp_path, inline, monkeypatch):
 def test_variants_of_a_file_are_compared_with_methods(wall, tmp_path, inline):
     text = "description: d\nbase: coliags\nvariants: {full: null, plain: [losses.depth=null]}\n"
     (tmp_path / "mine.yaml").write_text(text)
-    comparison = cp.compare(
-        ["3dgs", str(tmp_path / "mine.yaml")], wall, tmp_path / "new", steps=3, settings=TINY_SETTINGS
-    )
-    assert [result.method for result in comparison.results] == ["3dgs", "full", "plain"]
+    methods = ["scaffold-gs", str(tmp_path / "mine.yaml")]
+    comparison = cp.compare(methods, wall, tmp_path / "new", steps=3, settings=TINY_SETTINGS)
+    assert [result.method for result in comparison.results] == ["scaffold-gs", "full", "plain"]
 
 
 def test_a_report_of_a_comparison_is_the_commands(compared, tmp_path):

@@ -160,7 +160,7 @@ def variants_of(name: str) -> list[Variant]:
     if is_path(name):
         is_ablation = "variants" in read_tree(user_path(name)).value
     else:
-        check_name("method or ablation", name, (*methods, *ablations))
+        check_name("method or ablation", name, sorted([*methods, *ablations]))
         is_ablation = name in ablations
         if is_ablation and name in methods:
             raise InputError(f"'{name}' is a method and an ablation", "one of them", f"Give its file, {methods[name]}")

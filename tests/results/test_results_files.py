@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-import os
 
 import numpy as np
 import pytest
@@ -15,7 +14,7 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.results import hashing
 from coliags_plugin.results.hashing import ArraysHash, code_key, metrics_sha256, result_key
 from coliags_plugin.results.reading import facts, per_frame_table, read_result, write_result
-from coliags_plugin.results.record import VERSION, CostRecord, ProfileRecord, ProtocolRecord
+from coliags_plugin.results.record import VERSION, CostRecord, ProfileRecord
 from tests.results.made import METRICS, made_result, made_set
 
 

@@ -77,8 +77,8 @@ def write_report(paths: Sequence[Path], options: ReportOptions, scene: Section |
     for name in options.formats:
         check_name("format", name, (*SUFFIXES, "all", "text"))
     formats = [each for each in SUFFIXES if not {each, "all"}.isdisjoint(options.formats)]
-    if options.output is not None and not formats:
-        raise InputError(f"`output={options.output}` without a format of files", f"one of {', '.join(SUFFIXES)}")
+    if not formats and (options.output is not None or not options.formats):
+        raise InputError("no format of files", f"{', '.join(SUFFIXES)} or all; or, without `output`, text")
     output = options.output or Path("report")
     is_whole = options.output is not None and len(formats) == 1
     files = {each: output if is_whole else output.with_suffix(SUFFIXES[each]) for each in formats}
@@ -149,7 +149,7 @@ def _metrics(study: Study, options: ReportOptions, reference: str) -> Section:
     if len(study.scenes) > 1:
         text = "Means over the scenes of each set, of each the mean over its frames."
     text += " ↑ higher is better, ↓ lower is better."
-    if len(study.methods) > 1:
+    if len(study.methods) > 1 and {*options.formats} != {"text"}:
         text += " Best in bold, second underlined, by the printed digits; equal values share a rank."
     blocks: list[Block] = [Paragraph(text)]
     for test_set in study.test_sets:

@@ -260,8 +260,8 @@ def test_long_logs_are_drawn_through_means_one_curve_for_each_seed(tmp_path):
         assert text in page.words
     drawn = [attributes["d"] for attributes in page.all("path") if attributes["class"] == "line"]
     assert [path.count("L") for path in drawn].count(119) == 8
-    for run in runs:
-        (run / "metrics.jsonl").unlink()
+    for folder in runs:
+        (folder / "metrics.jsonl").unlink()
     assert "No training log" in report(tmp_path, runs).words
 
 
@@ -311,7 +311,7 @@ def test_formats(tmp_path, two_runs):
     (summary, _) = values["sections"][0]["tables"]
     assert [(row["method"], row["psnr"]) for row in summary["rows"]] == [("coliags", 32.0), ("3dgs", 30.0)]
     assert [result.method for result in written.results] == ["coliags", "3dgs"]
-    assert re.search(r"\ncoliags +32.00.*\n3dgs +30.00", str(written)) and "<" not in str(written)
+    assert re.search(r"\ncoliags +32.00.*\n3dgs +30.00", str(written))
     one_format = ReportOptions(tmp_path / "table.txt", formats="markdown")
     assert write_report(two_runs, one_format).files == [tmp_path / "table.txt"]
 
@@ -326,18 +326,19 @@ def test_text_is_printed_and_json_has_the_results_whatever_the_format(two_runs, 
     values = json.loads(capsys.readouterr().out)
     assert [(result["method"], result["psnr"]) for result in values["results"]] == [("coliags", 32.0), ("3dgs", 30.0)]
     assert values["written"] == [] and values["results"][0]["facts"]["seed"] == "0"
-    assert "without a format of files" in refused(capsys, "report", *two_runs, "--format", "text", "-o", "x.txt")
+    for words in (("--format", "text", "-o", "x.txt"), ("--format",)):
+        assert "no format of files" in refused(capsys, "report", *two_runs, *words)
     assert sorted(tmp_path.rglob("*")) == before
 
 
 def test_nothing_is_replaced_unless_asked_for(two_runs, tmp_path, capsys):
     out = tmp_path / "out"
     argv = ("report", two_runs[0], "--output", out / "r.html", "--format", "html", "csv")
-    (out / "r_files").mkdir(parents=True)
-    assert run(*argv) == 0, "an empty folder of pictures"
+    assert run(*argv) == 0
     for name in ("r.csv", "r_files/a.png"):
         for file in out.glob("r.*"):
             file.unlink()
+        (out / name).parent.mkdir(exist_ok=True)
         (out / name).write_text("former")
         assert f"{out / name.split('/')[0]} already exists" in refused(capsys, *argv)
         assert [file.name for file in out.glob("r.*")] == [name] * (name == "r.csv")
