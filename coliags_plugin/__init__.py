@@ -6,14 +6,13 @@ from typing import TYPE_CHECKING, Any
 from coliags_plugin.core import __version__
 
 if TYPE_CHECKING:
-    from coliags_plugin.api.comparing import ablate, compare, report, variant
+    from coliags_plugin.api.comparing import compare, report, variant
     from coliags_plugin.api.runs import Run, import_splats, load_run, train
     from coliags_plugin.api.scenes import load_scene, make_phantom, reconstruct
 
 __all__ = [
     "Run",
     "__version__",
-    "ablate",
     "compare",
     "import_splats",
     "load_run",
@@ -27,7 +26,7 @@ __all__ = [
 
 #: Names of the API by its modules.
 _MODULES = {
-    "comparing": ("ablate", "compare", "report", "variant"),
+    "comparing": ("compare", "report", "variant"),
     "runs": ("Run", "import_splats", "load_run", "train"),
     "scenes": ("load_scene", "make_phantom", "reconstruct"),
 }

@@ -94,4 +94,4 @@ def train_command(scene: Path, assignments: Sequence[str] = ()) -> str:
 def depth_commands(scene: Path) -> list[str]:
     """The commands that estimate the depth of a scene with poses and points, and train on it."""
     with_depth = scene.with_name(f"{scene.name}-depth")
-    return [coliags("depth", "estimate", scene, "--output", with_depth), train_command(with_depth)]
+    return [coliags("depth", scene, "--output", with_depth), train_command(with_depth)]

@@ -408,7 +408,7 @@ class RecordedDataManager(DataManager):
             raise NoPointsError(
                 f"{path} has neither depth files nor {missing}",
                 "depth or points for the initial Gaussians",
-                f"Estimate depth: coliags depth estimate {shlex.quote(str(path))} -o FOLDER; or put "
+                f"Estimate depth: coliags depth {shlex.quote(str(path))} -o FOLDER; or put "
                 f"{missing} (world of the poses) there; or {from_file}",
             )
         points = subsampled(read_points(source), settings.points_count, generator, source)

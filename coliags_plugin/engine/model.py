@@ -225,7 +225,7 @@ def _check_data(scene: Scene, losses: Mapping[str, Loss]) -> None:
             instead = ""
             if missing == "depth":
                 of_points = ", train the method coliags-plus on its points" if "sparse_depth" in there else ""
-                instead = f"{of_points}, or make a scene with depth: coliags depth estimate"
+                instead = f"{of_points}, or make a scene with depth: coliags depth"
             raise InputError(
                 f"loss term '{key}' needs {_DATA.get(missing, missing)}, and no training frame of scene "
                 f"'{scene.name}' has any",
@@ -235,7 +235,7 @@ def _check_data(scene: Scene, losses: Mapping[str, Loss]) -> None:
         if loss.reads_any and not loss.reads_any & there:
             log.warning(
                 "no training frame of scene '%s' has depth, so loss term '%s' does nothing, and floaters are likely; "
-                "`coliags depth estimate` makes a scene with depth",
+                "`coliags depth` makes a scene with depth",
                 scene.name,
                 key,
             )
@@ -256,7 +256,7 @@ def _check_points_in_view(config: MethodConfig, scene: Scene) -> None:
     raise InputError(
         f"{problem}, and nothing nearer than {near:g} is drawn",
         "lengths in mm, and poses and points of one world",
-        "`coliags data check` looks into poses, depth and units; small units on purpose need `near_plane=LENGTH`",
+        "`coliags check data` looks into poses, depth and units; small units on purpose need `near_plane=LENGTH`",
     )
 
 

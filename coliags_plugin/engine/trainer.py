@@ -289,7 +289,7 @@ class Trainer:
             raise NothingDrawnError(
                 f"nothing was drawn in the last {MAX_BLANK_VIEWS} views, until step {step}: their mean alpha is below "
                 f"{BLANK_ALPHA:g}. Checkpoints stay whole. Learning rates or weights of losses may be too large, or "
-                f"near_plane {self.method.config.near_plane:g} may lie beyond the tissue; `coliags data check` looks "
+                f"near_plane {self.method.config.near_plane:g} may lie beyond the tissue; `coliags check data` looks "
                 "into poses and units."
             )
 

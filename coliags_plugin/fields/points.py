@@ -28,7 +28,7 @@ def initial_positions(scene: Scene) -> Float[Tensor, "N 3"]:
         raise InputError(
             "the scene has no initial points",
             "at least one",
-            "Give the data manager points or depth; coliags depth estimate makes depth from posed images",
+            "Give the data manager points or depth; coliags depth makes depth from posed images",
         )
     return scene.points.positions
 

@@ -88,7 +88,7 @@ def surface_distances(scene: Scene) -> Float[Tensor, "2"]:
         raise InputError(
             "no training camera has an initial point in view",
             "points on the surface that the cameras see, between which and the cameras rays are sampled",
-            "Look at poses and points with `coliags data check`",
+            "Look at poses and points with `coliags check data`",
         )
     return torch.stack([NEAR_MARGIN * all_distances.min(), FAR_MARGIN * all_distances.max()])
 

@@ -71,8 +71,8 @@ COMMANDS: dict[str, type[Settings]] = {
     "poses sfm": SfmSettings,
     "poses sfm, under `camera.`": CameraSettings,
     "poses sfm, under `tracks.`": TrackSettings,
-    "poses sfm and depth estimate, under `features.`": FeatureSettings,
-    "depth estimate": DepthEstimationSettings,
+    "poses sfm and depth, under `features.`": FeatureSettings,
+    "depth": DepthEstimationSettings,
     "mesh": MeshSettings,
     "coverage": CoverageSettings,
 }

@@ -97,11 +97,11 @@ def test_terms_count_between_their_steps(tmp_path):
 def test_the_methods_made_for_such_data_are_named(tmp_path, caplog):
     scene, points = wall_scene(), SparseDepth(torch.tensor([[3.5, 2.5]]), torch.tensor([20.0]))
     bare = [frame.with_maps(depth=None) for frame in scene.train]
-    with pytest.raises(InputError, match=r"or make a scene with depth: coliags depth estimate") as caught:
+    with pytest.raises(InputError, match=r"or make a scene with depth: coliags depth") as caught:
         start(tmp_path / "run", method="scaffold-gs-depth", scene=replace(scene, train=bare))
     assert "coliags-plus" not in str(caught.value)
     sparse = [replace(frame, sparse_depth=points) for frame in bare]
-    with pytest.raises(InputError, match=r"train the method coliags-plus on its points, or .* depth estimate"):
+    with pytest.raises(InputError, match=r"train the method coliags-plus on its points, or .* coliags depth"):
         start(tmp_path / "run", method="scaffold-gs-depth", scene=replace(scene, train=sparse))
     for train, warned in ((bare, True), (sparse, False)):
         caplog.clear()
