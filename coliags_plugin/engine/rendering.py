@@ -48,9 +48,9 @@ def render_run(trained: TrainedRun, options: RenderOptions) -> Path:
     A relit run has its light in ``lamp.yaml``, and no colour errors, there being no images in that light. Depth, of one
     of the kinds of docs/conventions.md 3, is hatched where alpha is below 0.5, and has no errors where the scene's own
     is estimated; as float32 TIFF it has scene units and all pixels. Errors of the frames have one scale, in a picture
-    beside their folder. Feature channels have one or three numbers, 1 is
-    white. The video, ``trajectory.mp4``, has every frame's view in video order, rgb beside depth. With a camera path
-    to go ``along``, there are no images of frames, and the video is ``path.mp4``. Returns the folder.
+    beside their folder. Feature channels have one or three numbers, 1 is white. The video, ``trajectory.mp4``, has
+    every frame's view in video order, rgb beside depth. With a camera path to go ``along``, there are no images of
+    frames, and the video is ``path.mp4``. Returns the folder.
     """
     along = None if options.along is None else CameraPath.read(options.along)
     output = options.output or trained.run.path / ("path" if along else "relit" if trained.relit else "renders")
