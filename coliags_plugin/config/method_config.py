@@ -9,10 +9,10 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, ValidationInfo, field_validator, model_validator
 from typing_extensions import Self
 
-from coliags_plugin.config.yaml_tree import Node, at_origins, dump, dump_inline, merge, override_all, read_tree
+from coliags_plugin.config.yaml_tree import Node, at_origins, deep_merge, dump, dump_inline, merge, override_all, read_tree
 from coliags_plugin.core import registry
 from coliags_plugin.core.components import (
     Component,
@@ -62,6 +62,14 @@ class ScheduleSettings(Settings):
     checkpoint_every: int = Field(default=5_000, ge=1)  # steps between checkpoints; the last step has one, too
 
 
+def default_rates(field: Component | None, modules: Mapping[str, Component]) -> dict[str, Mapping[str, Any]]:
+    """Learning rates that the components declare, by parameter group: a module's as ``<module>.<group>``."""
+    rates = {} if field is None else field.rates
+    for name, module in modules.items():
+        rates |= {f"{name}.{group}": rate for group, rate in module.rates.items()}
+    return rates
+
+
 #: Parts of a method that are one component, and its kind.
 _SECTIONS = {"datamanager": "datamanagers", "field": "fields", "renderer": "renderers", "strategy": "strategies"}
 
@@ -79,9 +87,15 @@ class MethodConfig(Settings):
     sampler: SamplerNode = Field(default="frames", validate_default=True)  # what each step looks at
     strategy: StrategyNode  # grows and prunes
     losses: dict[str, LossNode] = Field(min_length=1)  # terms by a key of your choice
-    optimizers: dict[str, OptimizerSettings]  # rates by parameter group, of all of them
+    # rates by parameter group; those of a component's groups are merged into its defaults
+    optimizers: dict[str, OptimizerSettings] = Field(default_factory=dict, validate_default=True)
     schedule: ScheduleSettings = ScheduleSettings()  # how long to train and how often to write
     protocol: str = "paper"  # evaluation protocol
+
+    @field_validator("optimizers", mode="before")
+    @classmethod
+    def _over_defaults(cls, groups: object, info: ValidationInfo) -> object:
+        return deep_merge(default_rates(info.data.get("field"), info.data.get("modules", {})), groups)
 
     @field_validator("losses", "optimizers", "modules", mode="before")
     @classmethod

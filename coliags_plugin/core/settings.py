@@ -64,6 +64,8 @@ class Configurable(Generic[SettingsT]):
     """Base class of what has options: ``class EdgesLoss(Loss[EdgesSettings])`` names their class, ``Settings``."""
 
     Settings: ClassVar[type[Settings]]
+    #: Default learning rates, of a component that learns: options of ``optimizers`` by parameter group.
+    rates: ClassVar[Mapping[str, Mapping[str, Any]]] = {}
     settings: SettingsT
 
     def __init_subclass__(cls, **options: object) -> None:

@@ -69,6 +69,11 @@ class AnchorField(GaussianField[AnchorFieldSettings]):
     primitive: ClassVar[str] = "gaussians3d"
     elements: ClassVar[str] = "anchors"
     row_parameters: ClassVar[tuple[str, ...]] = ("offsets", "features", "scalings")
+    rates = {  # Scaffold-GS's released code
+        "offsets": {"lr": 0.01, "final_lr": 0.0001, "times_extent": True},
+        "features": {"lr": 0.0075},
+        "scalings": {"lr": 0.007},
+    }
 
     anchors: Tensor
     normals: Tensor | None

@@ -64,6 +64,11 @@ class AttenuatedAppearanceHead(AppearanceHead[AttenuatedAppearanceSettings]):
     """
 
     decoding = "networks"
+    rates = {
+        "attenuation": {"lr": 0.01, "final_lr": 0.0005},
+        "lamp_offset": {"lr": 0.01, "final_lr": 0.001},  # scene units
+        "shadow": {"lr": 0.02},  # a group with ``shadows`` alone
+    }
 
     reference: Tensor
     lamps: Tensor

@@ -134,6 +134,15 @@ class LitGaussians(ExplicitField[LitGaussiansSettings]):
     row_parameters: ClassVar[tuple[str, ...]] = (*ExplicitField.row_parameters, "albedos", "roughness", "f0")
     host_buffers: ClassVar[tuple[str, ...]] = ("network_on",)
     scale_count: ClassVar[int] = 2
+    rates = {  # PR-Endo's released code
+        **ExplicitField.rates,
+        "opacities": {"lr": 0.05},
+        "albedos": {"lr": 0.000705},  # 0.0025 of albedo / 0.28209
+        "roughness": {"lr": 0.002},
+        "f0": {"lr": 0.002},
+        "lamp": {"lr": 0.003},
+        "diffuse_network": {"lr": 0.0005},
+    }
 
     extent: Tensor
     network_on: Tensor

@@ -227,6 +227,9 @@ class ReimNerf(_NetworkLevel, RadianceField[ReimNerfFieldSettings]):
         bounds: Distances between which rays are sampled, scene units. [2]
     """
 
+    #: Released code: halved at 1/2 and at 3/4 of the run.
+    rates = dict.fromkeys(("coarse", "fine"), {"lr": 0.0005, "halve_at": (0.5, 0.75), "eps": 1e-8})
+
     bounds: Tensor
 
     def __init__(self, settings: ReimNerfFieldSettings, generator: torch.Generator) -> None:

@@ -161,6 +161,8 @@ class FrameGain(ViewModule[FrameGainSettings]):
         rate: Share of the learning rate. []
     """
 
+    rates = {"gain": {"lr": 0.03, "final_lr": 0.001}}
+
     fitted: Tensor
     rate: Tensor
 
@@ -265,6 +267,8 @@ class CameraResponse(ViewModule[ResponseSettings]):
     Attributes:
         log_slope: Logarithm of the slope of every segment. [K]
     """
+
+    rates = {"slope": {"lr": 0.03, "final_lr": 0.001}}
 
     def __init__(self, settings: ResponseSettings, scene: Scene) -> None:
         super().__init__(settings, scene)

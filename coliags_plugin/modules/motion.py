@@ -50,6 +50,11 @@ class PoseCorrection(ViewModule[CorrectionSettings]):
     camera. Free cameras stay.
     """
 
+    rates = {
+        "rotation": {"lr": 0.0001, "final_lr": 0.00001},  # radians
+        "translation": {"lr": 0.003, "final_lr": 0.0003},  # scene units, at depths of about 30
+    }
+
     def __init__(self, settings: CorrectionSettings, scene: Scene) -> None:
         super().__init__(settings, scene)
         self.frames, self._applies = FrameRows(scene), settings.apply_to(scene)
@@ -120,6 +125,7 @@ class ImageWarp(ViewModule[ImageWarpSettings]):
     """
 
     whole_image: ClassVar[bool] = True
+    rates = {"displacement": {"lr": 0.01, "final_lr": 0.001}}  # percent of the image's width
 
     def __init__(self, settings: ImageWarpSettings, scene: Scene) -> None:
         super().__init__(settings, scene)
