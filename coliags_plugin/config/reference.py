@@ -1,166 +1,126 @@
-"""Reference of components: what each is, its options, and its default learning rates, from classes and their source.
-
-Names, types, ranges and defaults of options are pydantic's. The meaning of one is its ``description``, the string below
-it, the comment behind it or the one above it, whichever the source has.
-"""
+"""Reference of components and options: types, ranges and defaults from settings classes, meanings from their source."""
 
 from __future__ import annotations
 
-import ast
 import inspect
-import io
 import json
 import re
-import textwrap
-import tokenize
 import types
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
-from pydantic import PlainValidator
-from pydantic.fields import FieldInfo
 from pydantic_core import to_jsonable_python
 
+from coliags_plugin.core.components import Component
+from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.registry import REGISTRIES
 from coliags_plugin.core.settings import Settings
 
+_NAMES = {int: "integer", float: "number", bool: "true or false", str: "text", type(None): "null", Path: "path"}
+_BOUNDS = {"ge": ">=", "gt": ">", "le": "<=", "lt": "<", "min_length": "at least"}
+#: Comments on lines of their own, then an option and the comment or the string behind it.
+_OPTION = re.compile(r'((?:^    #.*\n)*)^    (\w+): .*?(?:  # (.*)|\n    """([^"]*)""")?$', re.MULTILINE)
 
-@dataclass(frozen=True)
-class OptionReference:
-    """An option of a component or command; names in texts are in backticks."""
 
-    name: str
-    type: str  # with choices and range
-    required: bool
-    default: Any  # as JSON value; None where it is required
-    meaning: str
+def plain_doc(target: object, end: str = "\n\n") -> str:
+    """First paragraph of a docstring, or other beginning, on one line, with names in single backticks."""
+    text = inspect.cleandoc(vars(target).get("__doc__") or "").partition(end)[0]
+    return re.sub(r":\w+:`~?([^`]+)`", r"`\1`", " ".join(text.replace("``", "`").split()))
 
-    @property
-    def default_text(self) -> str:
-        """The default as YAML writes it."""
-        if self.required:
-            return "required"
-        if isinstance(self.default, str):
-            return self.default or "empty"
-        if isinstance(self.default, dict) and self.default:  # of nested settings
-            return "as below"
-        exact = json.dumps(self.default)
-        return f"{self.default:.4g}" if isinstance(self.default, float) and len(exact) > 8 else exact
+
+def summaries(kind: str) -> dict[str, str]:
+    """What each component of a kind is, in one line, with the source of those that are not built in."""
+    texts = {}
+    for name in REGISTRIES[kind]:
+        try:
+            text = plain_doc(REGISTRIES[kind].get(name), "\n")
+        except InputError as error:
+            text = error.seen
+        texts[name] = f"{text} {REGISTRIES[kind].source_text(name)}".strip()
+    return texts
 
 
 def describe(kind: str, name: str) -> dict[str, Any]:
-    """A registered component as JSON values: description, source, options and default learning rates by group."""
+    """A component as JSON values: description, source, options, and default learning rates by parameter group."""
     found = REGISTRIES[kind].get(name)
-    settings = getattr(found, "Settings", None)
     return {
         "kind": kind,
         "name": name,
         "source": REGISTRIES[kind].source(name),
-        "description": " ".join(plain(inspect.getdoc(found) or "").split("\n\n")[0].split()),
-        "options": options_of(settings) if settings else [],
+        "description": plain_doc(found),
+        "options": options_of(getattr(found, "Settings", Settings)),
         "parameter_groups": getattr(found, "rates", {}),
     }
 
 
-def first_line(found: object) -> str:
-    """First line of a docstring; empty without one."""
-    return plain(inspect.getdoc(found) or "").partition("\n")[0]
-
-
-def plain(text: str) -> str:
-    """A docstring with names in single backticks, without Sphinx's roles."""
-    return re.sub(r":\w+:`~?([^`]+)`", r"`\1`", text.replace("``", "`"))
-
-
-def options_of(settings: type[Settings]) -> list[OptionReference]:
-    """All options of a settings class, inherited ones first."""
+def options_of(settings: type[Settings]) -> list[dict[str, Any]]:
+    """Name, type, default as a JSON value unless one must be given, and meaning of every option of a class."""
     told = meanings(settings)
     return [
-        OptionReference(name, type_text(field), field.is_required(), _default(field), told.get(name, ""))
+        {
+            "name": name,
+            "type": type_text(field.annotation, field.metadata),
+            **(
+                {}
+                if field.is_required()
+                else {"default": to_jsonable_python(field.get_default(call_default_factory=True))}
+            ),
+            "meaning": told.get(name, ""),
+        }
         for name, field in settings.model_fields.items()
     ]
 
 
-def _default(field: FieldInfo) -> Any:
-    return None if field.is_required() else to_jsonable_python(field.get_default(call_default_factory=True))
+def default_text(option: Mapping[str, Any]) -> str:
+    """The default of an option as YAML writes it."""
+    default = option.get("default", "required")
+    is_nested = isinstance(default, dict) and default
+    return "as below" if is_nested else default or "empty" if isinstance(default, str) else json.dumps(default)
 
 
-_NAMES = {int: "integer", float: "number", bool: "true or false", str: "text", type(None): "null", Path: "path"}
-
-
-def type_text(field: FieldInfo) -> str:
+def type_text(annotation: Any, metadata: Sequence[Any] = ()) -> str:
     """Type and range of an option, in words."""
-    return _with_range(_type(field.annotation, field.metadata), field.metadata)
-
-
-def _type(annotation: Any, metadata: Sequence[Any] = ()) -> str:  # noqa: PLR0911 (one for each kind of annotation)
-    for item in metadata:
-        kind = next(iter(getattr(item.func, "args", ())), None) if isinstance(item, PlainValidator) else None
-        if kind in REGISTRIES:  # a node of core.components
-            return f"component of {kind}"
+    if get_origin(annotation) is Annotated:
+        annotation, *metadata = get_args(annotation)
     origin, args = get_origin(annotation), get_args(annotation)
-    if origin is Annotated:
-        return _with_range(_type(args[0], args[1:]), args[1:])
-    if origin is Literal:
-        return f"one of {', '.join(map(str, args))}"
-    if origin in (Union, types.UnionType):
-        return " or ".join(map(_type, args))
-    if origin is tuple and args[-1:] == (Ellipsis,):
-        return f"list of {_type(args[0])}"
-    if origin is tuple:
-        return f"{len(args)} times {_type(args[0])}" if len(set(args)) == 1 else f"[{', '.join(map(_type, args))}]"
-    if inspect.isclass(origin) and issubclass(origin, Mapping):
-        return f"entries, each {_type(args[1])}"
-    if inspect.isclass(annotation) and issubclass(annotation, Settings):
-        return "options below"
-    return _NAMES.get(annotation, getattr(annotation, "__name__", str(annotation)))
-
-
-def _with_range(text: str, metadata: Sequence[Any]) -> str:
-    signs = {"ge": ">=", "gt": ">", "le": "<=", "lt": "<", "min_length": "at least"}
-    # A Field inside Annotated holds its limits in a list.
-    limits = [limit for item in metadata for limit in getattr(item, "metadata", [item])]
-    found = [(sign, getattr(limit, side, None)) for limit in limits for side, sign in signs.items()]
-    return ", ".join([text, *(f"{sign} {bound:g}" for sign, bound in found if bound is not None)])
-
-
-def meanings(settings: type[Settings]) -> dict[str, str]:
-    """Meaning of each option as a sentence, inherited ones included, as far as description or source say it."""
-    found: dict[str, str] = {}
-    for owner in reversed(settings.__mro__):
-        if issubclass(owner, Settings):
-            found |= _written_meanings(owner)
-    found |= {name: field.description for name, field in settings.model_fields.items() if field.description}
-    return {name: plain(text[0].upper() + text[1:].removesuffix(".") + ".") for name, text in found.items()}
+    if annotation is Component:
+        text = f"component of {metadata[0].func.args[0]}"
+    elif origin is Literal:
+        text = f"one of {', '.join(map(str, args))}"
+    elif origin in (Union, types.UnionType):
+        text = " or ".join(map(type_text, args))
+    elif origin is tuple and len(set(args)) == 1:
+        text = f"{len(args)} times {type_text(args[0])}"
+    elif origin is tuple:
+        text = f"list of {type_text(args[0])}" if ... in args else f"[{', '.join(map(type_text, args))}]"
+    elif origin is not None and issubclass(origin, Mapping):
+        text = f"entries, each {type_text(args[1])}"
+    else:
+        is_nested = isinstance(annotation, type) and issubclass(annotation, Settings)
+        text = (
+            "options below" if is_nested else _NAMES.get(annotation, getattr(annotation, "__name__", str(annotation)))
+        )
+    # A Field inside Annotated holds its bounds in a list.
+    limits = [limit for each in metadata for limit in getattr(each, "metadata", [each])]
+    bounds = [(sign, getattr(limit, name, None)) for limit in limits for name, sign in _BOUNDS.items()]
+    return ", ".join([text, *(f"{sign} {bound:g}" for sign, bound in bounds if bound is not None)])
 
 
 @cache
-def _written_meanings(settings: type[Settings]) -> dict[str, str]:
-    """Strings and comments at the options in a class's own source; none without source, as in a console."""
-    try:
-        source = textwrap.dedent(inspect.getsource(settings))
-    except (OSError, TypeError):
-        return {}
-    lines = source.splitlines()
-    comments = {
-        token.start[0]: token.string.lstrip("#: ").strip()
-        for token in tokenize.generate_tokens(io.StringIO(source).readline)
-        if token.type == tokenize.COMMENT and not re.match(r"#\s*(noqa|type:|ruff:)", token.string)
+def meanings(settings: type[Settings]) -> dict[str, str]:
+    """Meaning of each option: its ``description``, or the comment or string at it in the source, where there is any."""
+    found: dict[str, str] = {}
+    for owner in reversed(settings.__mro__):
+        try:
+            source = inspect.getsource(owner) if issubclass(owner, Settings) else ""
+        except (OSError, TypeError):
+            continue  # defined in a console
+        for above, name, behind, below in _OPTION.findall(source):
+            found[name] = below or behind or re.sub(r"^    #:?", "", above, flags=re.MULTILINE) or found.get(name, "")
+    found |= {name: field.description for name, field in settings.model_fields.items() if field.description}
+    texts = {
+        name: " ".join(found[name].replace("``", "`").split()) for name in settings.model_fields if found.get(name)
     }
-    body = ast.parse(source).body[0].body  # type: ignore[attr-defined]
-    found = {}
-    for node, after in zip(body, [*body[1:], None], strict=True):
-        if not isinstance(node, ast.AnnAssign) or not isinstance(node.target, ast.Name):
-            continue
-        below = getattr(getattr(after, "value", None), "value", None) if isinstance(after, ast.Expr) else None
-        beside = [comments[line] for line in range(node.lineno, (node.end_lineno or 0) + 1) if line in comments]
-        above = list[str]()
-        while (line := node.lineno - 1 - len(above)) in comments and lines[line - 1].lstrip().startswith("#"):
-            above.insert(0, comments[line])
-        text = " ".join([below] if isinstance(below, str) else beside or above)
-        if text:
-            found[node.target.id] = " ".join(text.split())
-    return found
+    return {name: f"{text[0].upper()}{text[1:].removesuffix('.')}." for name, text in texts.items()}

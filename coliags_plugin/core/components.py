@@ -12,7 +12,7 @@ from pydantic_core import PydanticCustomError
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.registry import REGISTRIES, Resolver
-from coliags_plugin.core.settings import Settings, invalid_reported
+from coliags_plugin.core.settings import Rates, Settings, invalid_reported
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class Component:
         return REGISTRIES[self.kind].get(self.name)
 
     @property
-    def rates(self) -> dict[str, Mapping[str, Any]]:
+    def rates(self) -> Rates:
         """Default learning rates by parameter group, with those of the components among its options."""
         parts = (self, *components_of(self.settings))
         return {group: rates for part in parts for group, rates in part.target.rates.items()}

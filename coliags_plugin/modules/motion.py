@@ -16,7 +16,7 @@ from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.json_files import JsonObject
 from coliags_plugin.core.render_output import RenderOutput
 from coliags_plugin.core.scenes import Scene, View
-from coliags_plugin.core.settings import Settings
+from coliags_plugin.core.settings import Rates, Settings
 from coliags_plugin.core.tensors import bilinear, constant
 from coliags_plugin.modules.frame_rows import FrameRows
 
@@ -50,7 +50,7 @@ class PoseCorrection(ViewModule[CorrectionSettings]):
     camera. Free cameras stay.
     """
 
-    rates = {
+    rates: ClassVar[Rates] = {
         "rotation": {"lr": 0.0001, "final_lr": 0.00001},  # radians
         "translation": {"lr": 0.003, "final_lr": 0.0003},  # scene units, at depths of about 30
     }
@@ -125,7 +125,7 @@ class ImageWarp(ViewModule[ImageWarpSettings]):
     """
 
     whole_image: ClassVar[bool] = True
-    rates = {"displacement": {"lr": 0.01, "final_lr": 0.001}}  # percent of the image's width
+    rates: ClassVar[Rates] = {"displacement": {"lr": 0.01, "final_lr": 0.001}}  # percent of the image's width
 
     def __init__(self, settings: ImageWarpSettings, scene: Scene) -> None:
         super().__init__(settings, scene)

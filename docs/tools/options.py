@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from coliags_plugin.config.method_config import MethodConfig, OptimizerSettings, ScheduleSettings
-from coliags_plugin.config.reference import describe, options_of, plain
+from coliags_plugin.config.reference import default_text, options_of, plain_doc
 from coliags_plugin.config.yaml_tree import dump_inline
 from coliags_plugin.core.registry import REGISTRIES, Registry
 from coliags_plugin.core.settings import Settings
@@ -104,7 +104,7 @@ def _of_kind(kind: str, registry: Registry) -> Iterator[str]:
         yield table(settings, own_only=True)
     for name, found in builtin.items():
         yield f"### {kind}: {name}\n"
-        yield f"{as_markdown(describe(kind, name)['description'])}\n"
+        yield f"{as_markdown(plain_doc(found))}\n"
         inherited = [f"those of `{settings.__name__}`" for settings in chains[name] if settings in shared]
         own = [settings for settings in chains[name] if settings not in shared]
         if inherited:
@@ -112,7 +112,7 @@ def _of_kind(kind: str, registry: Registry) -> Iterator[str]:
             yield f"{text}\n"
         for settings in own:
             yield table(settings, own_only=True)
-        if rates := describe(kind, name)["parameter_groups"]:
+        if rates := getattr(found, "rates", {}):
             yield f"{rates_text(rates)}\n"
 
 
@@ -134,17 +134,18 @@ def whole_text(found: type) -> str:
 
 def as_markdown(text: str) -> str:
     """Sphinx's roles as code, and pages of the documentation as links."""
-    return re.sub(r"`?docs/((?:layouts/|rivals/)?[\w-]+\.md)`?", r"[\1](\1)", plain(text))
+    text = re.sub(r":\w+:`~?([^`]+)`", r"`\1`", text.replace("``", "`"))
+    return re.sub(r"`?docs/((?:layouts/|rivals/)?[\w-]+\.md)`?", r"[\1](\1)", text)
 
 
 def table(settings: type[Settings], own_only: bool = False) -> str:
     """Options of a class as a Markdown table."""
     rows = ["| option | type | default | what |", "|---|---|---|---|"]
     for option in options_of(settings):
-        if own_only and option.name not in own_names(settings):
+        if own_only and option["name"] not in own_names(settings):
             continue
-        default = option.default_text if option.default_text in WORDS else f"`{option.default_text}`"
-        cells = (f"`{option.name}`", option.type, default, as_markdown(option.meaning))
+        default = default_text(option) if default_text(option) in WORDS else f"`{default_text(option)}`"
+        cells = (f"`{option['name']}`", option["type"], default, as_markdown(option["meaning"]))
         rows.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |")
     return "\n".join(rows) + "\n"
 
