@@ -27,23 +27,18 @@ class ListCommand:
         """Print names by kind, with the source of those that are not built in, or a description of a component."""
         from coliags_plugin.comparison.named_files import ABLATIONS, shipped
         from coliags_plugin.config.method_config import descriptions, method_files
-        from coliags_plugin.config.reference import summaries
         from coliags_plugin.core.errors import check_name
         from coliags_plugin.core.registry import REGISTRIES
 
         if self.name:
             check_name("kind of components", self.kind, REGISTRIES)
-            self._describe(self.kind, self.name)
+            self._describe()
             return
-
-        def names(kind: str) -> dict[str, str]:
-            return {name: REGISTRIES[kind].source_text(name) for name in REGISTRIES[kind]}
-
         texts: dict[str, Callable[[], dict[str, str]]] = {
             "methods": lambda: descriptions(method_files()),
             "benchmarks": lambda: descriptions(shipped()),
             "ablations": lambda: descriptions(shipped(ABLATIONS)),
-            **{kind: partial(names if self.kind == "all" else summaries, kind) for kind in REGISTRIES},
+            **{kind: partial(self._components, kind) for kind in REGISTRIES},
         }
         check_name("kind", self.kind, ("all", *texts))
         listed = {kind: texts[kind]() for kind in (texts if self.kind == "all" else [self.kind])}
@@ -54,21 +49,50 @@ class ListCommand:
             lines += [f"{indent}{name:<28}{text}".rstrip() for name, text in rows.items()]
         print_summary("\n".join(lines), listed, as_json=self.json)
 
-    def _describe(self, kind: str, name: str) -> None:
-        from coliags_plugin.config.reference import default_text, describe
+    def _components(self, kind: str) -> dict[str, str]:
+        """Source of each component that is not built in, behind what it is if one kind is listed, which imports it."""
+        from coliags_plugin.config.reference import plain_doc
+        from coliags_plugin.core.errors import InputError
+        from coliags_plugin.core.registry import REGISTRIES
+
+        texts = {}
+        for name in REGISTRIES[kind]:
+            source = REGISTRIES[kind].source(name)
+            try:
+                text = plain_doc(REGISTRIES[kind].get(name), "\n") if kind == self.kind else ""
+            except InputError as error:
+                text = error.seen
+            texts[name] = text if source == "built in" else f"{text} ({source})".strip()
+        return texts
+
+    def _describe(self) -> None:
+        from coliags_plugin.config.reference import options_of, plain_doc
         from coliags_plugin.config.yaml_tree import dump_inline
+        from coliags_plugin.core.registry import REGISTRIES
         from coliags_plugin.reporting.model import Column
         from coliags_plugin.reporting.text_formats import DisplayTable
 
-        facts = describe(kind, name)
-        rows = [{**option, "default": default_text(option)} for option in facts["options"]]
-        rates = [
-            {"group": group, "default rate": dump_inline(rate)} for group, rate in facts["parameter_groups"].items()
-        ]
-        parts = [f"{name} ({facts['source']}): {facts['description']}"]
-        for keys, table in ((("name", "type", "default", "meaning"), rows), (("group", "default rate"), rates)):
-            parts += [str(DisplayTable("", [Column(key, words=True) for key in keys], table))] if table else []
-        print_summary("\n\n".join(parts), facts, as_json=self.json)
+        registry = REGISTRIES[self.kind]
+        target, source = registry.get(self.name), registry.source(self.name)
+        described, choices, rates = plain_doc(target), options_of(target), getattr(target, "rates", {})
+        tables = {
+            ("option", "type", "default", "meaning"): [
+                {
+                    **each,
+                    "option": each["name"],
+                    "default": dump_inline(each["default"]) if "default" in each else "required",
+                }
+                for each in choices
+            ],
+            ("parameter group", "default rate"): [
+                {"parameter group": group, "default rate": dump_inline(rate)} for group, rate in rates.items()
+            ],
+        }
+        parts = [": ".join(filter(None, (f"{self.name} ({source})", described)))]
+        for keys, rows in tables.items():
+            parts += [str(DisplayTable("", [Column(key, words=True) for key in keys], rows))] if rows else []
+        facts = {"description": described, "source": source, "options": choices, "parameter_groups": rates}
+        print_summary("\n\n".join(parts), {"kind": self.kind, "name": self.name, **facts}, as_json=self.json)
 
 
 @dataclass(frozen=True)

@@ -1,9 +1,8 @@
-"""Reference of components and options: types, ranges and defaults from settings classes, meanings from their source."""
+"""Reference of options: types, ranges and defaults from settings classes, meanings from their source."""
 
 from __future__ import annotations
 
 import inspect
-import json
 import re
 import types
 from collections.abc import Mapping, Sequence
@@ -14,14 +13,15 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin
 from pydantic_core import to_jsonable_python
 
 from coliags_plugin.core.components import Component
-from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.registry import REGISTRIES
 from coliags_plugin.core.settings import Settings
 
 _NAMES = {int: "integer", float: "number", bool: "true or false", str: "text", type(None): "null", Path: "path"}
 _BOUNDS = {"ge": ">=", "gt": ">", "le": "<=", "lt": "<", "min_length": "at least"}
-#: Comments on lines of their own, then an option and the comment or the string behind it.
-_OPTION = re.compile(r'((?:^    #.*\n)*)^    (\w+): .*?(?:  # (.*)|\n    """([^"]*)""")?$', re.MULTILINE)
+#: Comments on lines of their own, then an option, on one line or several, and the comment or string behind it.
+_OPTION = re.compile(
+    r'((?:^    #.*\n)*)^    (\w+): (?:.*[(\[]\n(?: {8}.*\n)*    [)\]].*?|.*?)(?:  # (.*)|\n    """([^"]*)""")?$',
+    re.MULTILINE,
+)
 
 
 def plain_doc(target: object, end: str = "\n\n") -> str:
@@ -30,33 +30,11 @@ def plain_doc(target: object, end: str = "\n\n") -> str:
     return re.sub(r":\w+:`~?([^`]+)`", r"`\1`", " ".join(text.replace("``", "`").split()))
 
 
-def summaries(kind: str) -> dict[str, str]:
-    """What each component of a kind is, in one line, with the source of those that are not built in."""
-    texts = {}
-    for name in REGISTRIES[kind]:
-        try:
-            text = plain_doc(REGISTRIES[kind].get(name), "\n")
-        except InputError as error:
-            text = error.seen
-        texts[name] = f"{text} {REGISTRIES[kind].source_text(name)}".strip()
-    return texts
-
-
-def describe(kind: str, name: str) -> dict[str, Any]:
-    """A component as JSON values: description, source, options, and default learning rates by parameter group."""
-    found = REGISTRIES[kind].get(name)
-    return {
-        "kind": kind,
-        "name": name,
-        "source": REGISTRIES[kind].source(name),
-        "description": plain_doc(found),
-        "options": options_of(getattr(found, "Settings", Settings)),
-        "parameter_groups": getattr(found, "rates", {}),
-    }
-
-
-def options_of(settings: type[Settings]) -> list[dict[str, Any]]:
-    """Name, type, default as a JSON value unless one must be given, and meaning of every option of a class."""
+def options_of(target: object) -> list[dict[str, Any]]:
+    """Options of settings or of a component: name, type, default as a JSON value unless one is required, meaning."""
+    settings = getattr(target, "Settings", target)
+    if not (isinstance(settings, type) and issubclass(settings, Settings)):
+        return []
     told = meanings(settings)
     return [
         {
@@ -71,13 +49,6 @@ def options_of(settings: type[Settings]) -> list[dict[str, Any]]:
         }
         for name, field in settings.model_fields.items()
     ]
-
-
-def default_text(option: Mapping[str, Any]) -> str:
-    """The default of an option as YAML writes it."""
-    default = option.get("default", "required")
-    is_nested = isinstance(default, dict) and default
-    return "as below" if is_nested else default or "empty" if isinstance(default, str) else json.dumps(default)
 
 
 def type_text(annotation: Any, metadata: Sequence[Any] = ()) -> str:

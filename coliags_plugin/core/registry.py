@@ -81,10 +81,6 @@ class Registry:
         self._discover()
         return self._sources[name]
 
-    def source_text(self, name: str) -> str:
-        """The source in parentheses; empty for what is built in."""
-        return "" if self.source(name) == "built in" else f"({self.source(name)})"
-
     def origin(self, name: str) -> dict[str, str]:
         """Class and source of a component, and its file with a hash where it has one, for the record of a run."""
         target = self.get(name)

@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from coliags_plugin.config.method_config import MethodConfig, OptimizerSettings, ScheduleSettings
-from coliags_plugin.config.reference import default_text, options_of, plain_doc
+from coliags_plugin.config.reference import options_of, plain_doc
 from coliags_plugin.config.yaml_tree import dump_inline
 from coliags_plugin.core.registry import REGISTRIES, Registry
 from coliags_plugin.core.settings import Settings
@@ -64,8 +64,6 @@ COMMANDS: dict[str, type[Settings]] = {
     "mesh": MeshSettings,
     "coverage": CoverageSettings,
 }
-#: Texts in the place of a default.
-WORDS = ("required", "empty", "as below")
 
 
 def page() -> str:
@@ -144,7 +142,9 @@ def table(settings: type[Settings], own_only: bool = False) -> str:
     for option in options_of(settings):
         if own_only and option["name"] not in own_names(settings):
             continue
-        default = default_text(option) if default_text(option) in WORDS else f"`{default_text(option)}`"
+        default = f"`{dump_inline(option['default'])}`" if "default" in option else "required"
+        if option["type"] == "options below":
+            default = "as below"
         cells = (f"`{option['name']}`", option["type"], default, as_markdown(option["meaning"]))
         rows.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |")
     return "\n".join(rows) + "\n"
