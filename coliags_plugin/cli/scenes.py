@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from coliags_plugin.cli.texts import coliags, parse_size, print_summary, train_command, view_command
+from coliags_plugin.cli.texts import coliags, depth_commands, parse_size, print_summary, train_command, view_command
 from coliags_plugin.config import options
 from coliags_plugin.core.errors import InputError
 
@@ -57,6 +57,7 @@ class PhantomCommand:
         """Generate the dataset."""
         from coliags_plugin.api.scenes import make_phantom
         from coliags_plugin.config.yaml_tree import parse_assignments
+        from coliags_plugin.core.registry import phantom_layouts
 
         names = ("preset", "trajectory", "frames", "light", "gain", "rotation_views")
         values = {name: getattr(self, name) for name in names}
@@ -66,7 +67,8 @@ class PhantomCommand:
             options["width"], options["height"] = parse_size(self.size)
         options |= parse_assignments(self.set)
         folder = make_phantom(self.output, **options)
-        print_summary(facts={"settings": options}, written=[folder], then=[train_command(folder)], as_json=self.json)
+        then = depth_commands(folder) if phantom_layouts.get(self.layout).has_points else [train_command(folder)]
+        print_summary(facts={"settings": options}, written=[folder], then=then, as_json=self.json)
 
 
 @dataclass(frozen=True)
@@ -89,6 +91,7 @@ class DataCommand:
         from coliags_plugin.checks.data.page import check_page, verdict
         from coliags_plugin.engine.data_formats import open_scene
         from coliags_plugin.engine.progress import progress_callback
+        from coliags_plugin.reconstruction.depth.scene import training_options
         from coliags_plugin.reporting.html_page import write_html
         from coliags_plugin.reporting.text_formats import page_text
 
@@ -101,12 +104,16 @@ class DataCommand:
             write_html(page, self.html)
         chosen = [f"datamanager.{key.removeprefix('datamanager.')}" for key in self.set]
         chosen += [] if self.data_format is None else [f"datamanager.name={self.data_format}"]
-        is_ready = check.facts["depth"] is not None and not check.findings
+        reading = [word for item in self.set for word in ("--set", item)]
+        reading += [] if self.data_format is None else ["--data-format", self.data_format]
+        then = [train_command(self.scene, chosen)]
+        if check.facts["depth"] is None:
+            then = depth_commands(self.scene, reading, training_options(scene))
         print_summary(
             f"{page_text(page)}\n\n{verdict(check)}",
             check.as_json(),
             written=[] if self.html is None else [self.html],
-            then=[train_command(self.scene, chosen)] if is_ready else [],
+            then=[] if check.findings else then,
             as_json=self.json,
         )
         if check.findings:

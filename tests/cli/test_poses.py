@@ -188,7 +188,7 @@ def test_sfm_makes_a_scene_that_trains_and_aligns(tube, tmp_path, capsys, caplog
     assert open_scene(out).provenance.unit == "unknown"
     assert end == [
         f"written: {out}",
-        f"next:    coliags depth estimate {out} --output {out}-depth",
+        f"next:    coliags depth {out} --output {out}-depth",
         f"next:    coliags train coliags-plus --data {out}-depth",
     ]
     assert sorted(path.name for path in (out / "images").iterdir()) == [f"{n:04d}_color.png" for n in range(0, 9, 2)]

@@ -250,7 +250,7 @@ def test_a_small_page_has_the_most_visible_gaussians(anchors):
     small = scene_page(trained, PageOptions(size=str(largest)))
     assert len(small.html.encode()) <= largest
     assert 0.4 < small.facts["gaussians"] / whole.facts["gaussians"] < 0.6
-    assert small.facts["cost"]["test"]["export"]["psnr"] > 10
+    assert small.facts["measured"]["test"]["in_light"]["psnr"] > 10
 
 
 def test_sizes():
