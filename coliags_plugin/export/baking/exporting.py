@@ -136,7 +136,7 @@ def _warn_of_light(exported: Exported, light: str) -> None:
         cause, nearer = "the lamp that moved with the camera is baked", ", and `light=recorded` comes nearer"
     if lost > _MUCH:
         log.warning(
-            "%s: brightness in a viewer differs from the video (%.1f dB), as %s; `coliags view RUN` shows the run itself%s",
+            "%s: brightness differs from the video (%.1f dB), as %s; `coliags view RUN` shows the run itself%s",
             *(exported.file.name, lost, cause, nearer),
         )
 
