@@ -20,6 +20,7 @@ from coliags_plugin import cli
 from coliags_plugin.cli.methods import CheckCommand, ConfigCommand
 from coliags_plugin.cli.runs import TrainCommand
 from coliags_plugin.cli.scenes import PhantomCommand
+from coliags_plugin.cli.texts import depth_commands
 from coliags_plugin.config.method_config import MethodConfig, OptimizerSettings, ScheduleSettings, load_method
 from coliags_plugin.core.registry import REGISTRIES
 from coliags_plugin.core.render_output import OUTPUTS
@@ -139,6 +140,11 @@ def commands() -> list[tuple[str, str]]:
         lines += re.findall(r"`(coliags [^`]+)`", prose)
         typed += [(name_of(page), line.strip()) for line in lines if re.match(r"(\w+=\S+ +)*coliags ", line.strip())]
     return typed
+
+
+@pytest.mark.parametrize("page", ["data.md", "depth.md", "poses.md", "layouts/c3vd-v2.md"])
+def test_pages_tell_the_same_way_to_depth_as_messages(page):
+    assert "\n".join(depth_commands(Path("SCENE"))) in (DOCS / page).read_text()
 
 
 #: Commands and their actions, which running text names alone.
