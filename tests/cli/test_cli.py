@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 from coliags_plugin import Run, load_run, report, train
+from coliags_plugin.cli.texts import depth_commands, train_command
 from coliags_plugin.comparison.scenes import find_scenes
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import read_rgb
@@ -217,6 +218,15 @@ def test_what_train_and_phantom_cannot_make(capsys, scene, tmp_path):
     for words in options:
         refused(capsys, "phantom", "-o", tmp_path / "p", *words.split())
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+@pytest.mark.parametrize(
+    ("layout", "commands"), [("colmap", depth_commands(Path("colon"))), ("c3vd", [train_command(Path("colon"))])]
+)
+def test_a_phantom_without_depth_leads_to_it(monkeypatch, capsys, layout, commands):
+    monkeypatch.setattr("coliags_plugin.api.scenes.make_phantom", lambda output, **options: output)
+    assert run("phantom", "-o", "colon", "--layout", layout) == 0
+    assert capsys.readouterr().out.splitlines() == ["written: colon", *(f"next:    {each}" for each in commands)]
 
 
 # Processes

@@ -165,7 +165,7 @@ def _gaussian_field(trained: TrainedRun) -> GaussianField:
         )
     if trained.model.view_modules:
         names = ", ".join(trained.model.view_modules)
-        log.warning("view modules are no part of a file of Gaussians and are left out: %s", names)
+        log.warning("what view modules do to single frames is no part of a file of Gaussians: %s", names)
     return field
 
 
@@ -173,8 +173,8 @@ def measure(trained: TrainedRun, cloud: SplatCloud, light: HeldLight | None) -> 
     """Compare a cloud with its run on every held-out frame, by the run's protocol; means per test set.
 
     Against the frames as recorded, the cloud's values are those that an import of its file evaluates to: it has no
-    lamp that moves, and no view modules. In the held light it is compared with the frames brought to that light: the
-    run's own render there, from where the run's view modules place the view, plus what the run's render misses of the
+    lamp that moves, and no frame's own gain. In the held light it is compared with the frames brought to it: the run's
+    own render there, from where the run's view modules place the view, plus what the run's render misses of the
     frame. By that the run's PSNR is that of its evaluation, and the cloud's differs by baking alone.
 
     Returns:

@@ -19,7 +19,8 @@ from coliags_plugin.core.gaussians import Gaussians, rotation_matrices
 from coliags_plugin.core.lamps import FlattenedLight, LightOfCamera
 from coliags_plugin.core.ply import read_vertices, write_ply
 from coliags_plugin.core.scenes import Frame
-from coliags_plugin.engine.held_light import flattened_light, mean_camera
+from coliags_plugin.engine.held_light import flattened_light, mean_camera, render_held
+from coliags_plugin.engine.model import Model
 from coliags_plugin.engine.rendering import render_view
 from coliags_plugin.export.baking import distillation, exporting
 from coliags_plugin.export.baking.baking import GaussianAverages, SeenColors, bake, blending_weights, fit_harmonics
@@ -28,6 +29,7 @@ from coliags_plugin.export.baking.exporting import measure
 from coliags_plugin.export.splats.cloud import SplatCloud, cloud_of_field, field_of_cloud
 from coliags_plugin.export.splats.formats import read_splats, write_splats
 from coliags_plugin.fields.spherical_harmonics import basis, colors
+from coliags_plugin.modules.exposure import CameraResponse, FrameGain
 from coliags_plugin.renderers.torch_renderer import TorchRenderer, TorchRendererSettings
 from tests.commands import refused, run
 from tests.export.splats.clouds import PARTS, random_cloud
@@ -355,6 +357,20 @@ def test_the_lamp_of_the_camera_itself_changes_nothing(run_of, method):
         fixed = trained.model.field.gaussians(camera, LightOfCamera(camera))
     assert torch.equal(moving.means, fixed.means) and torch.equal(moving.opacities, fixed.opacities)
     torch.testing.assert_close(fixed.colors, moving.colors, atol=1e-5, rtol=1e-4)
+
+
+def test_a_held_view_has_the_response_of_a_camera_and_no_gain_of_a_frame(run_of):
+    trained = run_of("3dgs").load()
+    model, scene = trained.model, trained.scene
+    gain, response = FrameGain(FrameGain.Settings(), scene), CameraResponse(CameraResponse.Settings(knee=0.1), scene)
+    with torch.no_grad():
+        gain.log_gain.copy_(random(*gain.log_gain.shape))
+        response.log_slope.fill_(-0.5)
+        both = Model(model.field, model.renderer, {"gain": gain, "response": response}, model.near_plane)
+        camera = replace(scene.train[1].camera, camera_to_world=scene.train[1].camera.camera_to_world.float())
+        bare, shaded = (render_held(each, camera, None, ("rgb",)).rgb for each in (model, both))
+    torch.testing.assert_close(shaded, response.curve(bare))
+    assert (bare - shaded).max() > 0.05
 
 
 def test_flattened_light_is_even_over_a_wall(run_of):

@@ -231,7 +231,7 @@ def test_the_command_writes_a_page_that_needs_no_network(anchors, tmp_path, caps
     summary, written = capsys.readouterr().out.strip().splitlines()
     assert written == f"written: {page}" and summary.partition(", ")[2] in text
     assert re.search(
-        r"step 2; ([\d,]+) of \1 Gaussians; recorded light; \d+\.\d\d dB in that light on 2 held-out", summary
+        r"step 2; ([\d,]+) of \1 Gaussians; recorded light; in that light: \d+\.\d\d dB on 2 held-out", summary
     )
     assert "<title>coliags on wall</title>" in text
     assert 'id="scene">{"layers":[{"about":"step 2; ' in text
