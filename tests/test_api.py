@@ -281,19 +281,18 @@ def test_what_fails_is_in_the_table(wall, tmp_path, inline, monkeypatch):
     assert "0 of 1 cells done, 1 failed" in repr(comparison)
 
 
-def test_an_ablation_is_a_comparison_of_a_files_variants(wall, tmp_path, inline):
+def test_variants_of_a_file_are_compared_with_methods(wall, tmp_path, inline):
     text = "description: d\nbase: coliags\nvariants: {full: null, plain: [losses.depth=null]}\n"
     (tmp_path / "mine.yaml").write_text(text)
-    comparison = cp.ablate(tmp_path / "mine.yaml", wall, tmp_path / "new", steps=3, settings=TINY_SETTINGS)
-    assert [result.method for result in comparison.results] == ["full", "plain"]
-    with pytest.raises(InputError, match="paper-rows"):
-        cp.ablate("paper-row", wall, tmp_path / "new")
+    methods = ["scaffold-gs", str(tmp_path / "mine.yaml")]
+    comparison = cp.compare(methods, wall, tmp_path / "new", steps=3, settings=TINY_SETTINGS)
+    assert [result.method for result in comparison.results] == ["scaffold-gs", "full", "plain"]
 
 
 def test_a_report_of_a_comparison_is_the_commands(compared, tmp_path):
     ours, theirs = tmp_path / "ours.html", tmp_path / "theirs.html"
-    files = cp.report(compared, ours, formats=["markdown", "csv"], title="Depth")
-    names = ("--format", "markdown", "--format", "csv", "--title", "Depth")
+    files = cp.report(compared, ours, formats=["markdown", "csv"], title="Depth").files
+    names = ("--format", "markdown", "csv", "--title", "Depth")
     assert run("report", compared.folder, "--output", theirs, *names) == 0
     assert [file.suffix for file in files] == [".md", ".csv"]
     for file in files:

@@ -68,7 +68,7 @@ def test_the_example_trains_and_is_evaluated(coliags, tmp_path):
 
 @pytest.mark.thorough
 def test_the_example_keeps_the_contract(coliags, tmp_path):
-    process = coliags("check", "round-gaussians")
+    process = coliags("check", "method", "round-gaussians")
     assert process.returncode == 0, process.stdout + process.stderr
     assert "19 passed, 0 failed, 2 skipped" in process.stdout
 

@@ -151,7 +151,7 @@ class Run:
         """
         from coliags_plugin.engine.rendering import choose_frames
 
-        return [frame.name for frame in choose_frames(self.load().scene, frames)]
+        return [frame.name for frame in choose_frames(self.load().scene, [frames])]
 
     def render(
         self, frame: str | Camera, *, depth: str = "depth_accumulated", outputs: Sequence[str] = ()
@@ -172,7 +172,7 @@ class Run:
 
     @takes(RenderOptions)
     def write_renders(self, options: RenderOptions) -> Path:
-        """Write colour, depth and error images of a set of frames, and a video along the trajectory; their folder.
+        """Write colour, depth and error images of frames, and a video along the trajectory; their folder.
 
         Raises:
             InputError: See :meth:`load`; no such frames or channel; the file is no camera path; or the folder exists or
@@ -357,7 +357,7 @@ def train(options: TrainOptions, *, view_port: int | None = None) -> Run:
 
 
 def warn_of_suspect_data(scene: Scene) -> None:
-    """Warn of what the quick checks of ``coliags data check`` find, in the lengths of the dataset."""
+    """Warn of what the quick checks of ``coliags check data`` find, in the lengths of the dataset."""
     from coliags_plugin.checks.data.check import check_scene
 
     stored = scene.scaled(1.0 / scene.provenance.training_scale)

@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import get_args
 
 from coliags_plugin.comparison.folder import ComparisonFolder
-from coliags_plugin.comparison.named_files import Variant
+from coliags_plugin.comparison.named_files import Variant, variants_of
 from coliags_plugin.comparison.plan import ComparisonCell, FailureRecord, make_cells
 from coliags_plugin.comparison.scenes import find_scenes, make_phantoms
 from coliags_plugin.comparison.worker import CellTask
-from coliags_plugin.config.method_config import is_path, method_name
+from coliags_plugin.config.method_config import is_path
 from coliags_plugin.config.options import CompareOptions
 from coliags_plugin.core import registry
 from coliags_plugin.core.errors import InputError, InterruptedRunError, check_name, check_number
@@ -33,7 +33,7 @@ from coliags_plugin.results.record import SEEN_SUFFIX, Result
 
 log = logging.getLogger(__name__)
 
-#: Names of methods, paths of method configs, and variants; or one of these.
+#: Names of methods and ablations, paths of their files, and variants; or one of these.
 Methods = str | Variant | Sequence[str | Variant]
 
 
@@ -252,7 +252,7 @@ def _states(cells: Sequence[ComparisonCell], comparison: ComparisonFolder) -> Di
 def plan_cells(methods: Methods, options: CompareOptions) -> list[ComparisonCell]:
     """The cells that are asked for, after what can be checked without writing anything."""
     methods = [methods] if isinstance(methods, (str, Variant)) else methods
-    variants = [each if isinstance(each, Variant) else Variant(method_name(each), each) for each in methods]
+    variants = [variant for each in methods for variant in ([each] if isinstance(each, Variant) else variants_of(each))]
     if not variants:
         raise InputError("no method", "at least one")
     twice = [name for name, count in Counter(variant.name for variant in variants).items() if count > 1]

@@ -30,18 +30,7 @@ OptionalInt = Annotated[int | None, _flag("INT")]
 OptionalFloat = Annotated[float | None, _flag("MM")]
 #: What is done by default, and left out by the flag ``--no-NAME``, which its help describes.
 DoneByDefault = Annotated[bool, _flag()]
-#: Texts separated by commas.
-Names = Annotated[
-    tuple[str, ...],
-    tyro.constructors.PrimitiveConstructorSpec(
-        nargs=1,
-        metavar="TEXT",
-        instance_from_str=lambda texts: tuple(filter(None, (part.strip() for part in texts[0].split(",")))),
-        is_instance=lambda value: isinstance(value, tuple),
-        str_from_instance=lambda names: [",".join(names)],
-    ),
-    _flag("TEXT"),
-]
+Names = Annotated[tuple[str, ...], _flag("NAME...")]
 
 #: ``--output`` or ``-o``: the one spelling of where a command writes.
 Output = Annotated[Path, tyro.conf.arg(aliases=("-o",), metavar="PATH")]
@@ -49,11 +38,12 @@ OptionalOutput = Annotated[Path | None, _flag("PATH", aliases=("-o",))]
 #: ``--set key=value``, repeatable; in Python a mapping.
 Assignments = Annotated[tuple[str, ...], tyro.conf.arg(name="set", metavar="KEY=VALUE"), tyro.conf.UseAppendAction]
 
-RunFolder = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(help="Run folder.")]
+Method = Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="METHOD")]
+RunFolder = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN", help="Run folder.")]
 SceneFolder = Annotated[Path, tyro.conf.arg(help="The scene's folder.")]
 _FORMAT_HELP = "Dataset format (`coliags list datamanagers`); default: recognised from the files."
 #: Name of a data manager; None: recognised from the files.
-DataFormat = Annotated[str | None, _flag("NAME", name="format", help=_FORMAT_HELP)]
+DataFormat = Annotated[str | None, _flag("NAME", help=_FORMAT_HELP)]
 MovedData = Annotated[Path | None, _flag("PATH", help="The scene's folder, where it has moved since training.")]
 Device = Annotated[
     str, tyro.conf.arg(metavar="auto|cpu|cuda|cuda:N", help="Device to compute on; cuda is the first CUDA device.")
@@ -117,18 +107,18 @@ class TrainOptions(Options):
         renderer: Renderer by name (`coliags list renderers`); default: the method's.
         resume: Continue from the run's latest checkpoint (without an output: the newest run of this method on this
             scene).
-        loggers: Also log to tensorboard or wandb, into the run folder (extra `loggers`), repeatable.
+        loggers: Also log to tensorboard or wandb, into the run folder (extra `loggers`).
         settings: Change a value of the method config, for instance field.voxel_size=1.0.
     """
 
-    method: tyro.conf.Positional[str]
+    method: Method
     data: SceneFolder
     output: OptionalOutput = None
     steps: OptionalInt = None
     seed: OptionalInt = None
     renderer: OptionalText = None
     resume: bool = False
-    loggers: Annotated[tuple[str, ...], tyro.conf.arg(name="logger", metavar="NAME"), tyro.conf.UseAppendAction] = ()
+    loggers: Names = ()
     settings: Assignments = ()
     data_format: DataFormat = None
     overwrite: Overwrite = False
@@ -181,24 +171,24 @@ class RenderOptions(Options):
 
     Args:
         output: Folder to create; default RUN/renders, in another light RUN/relit, along a path RUN/path.
-        frames: Which frames: train, all, or the name of a test set.
+        frames: Sets of frames: train, all, or test sets by name (default: test); or single frames by name, no video.
         along: Render only a video along this camera path, a file saved in `coliags view`.
         video: Also write trajectory.mp4, rgb beside depth.
         fps: Frames per second of the video.
         depth_kind: Which depth: sum w z, the paper's; the same divided by alpha; or that of the Gaussian at which half
             of the light is absorbed. Pictures are hatched where alpha is below 0.5.
         depth_tiff: Also write depth as float32 TIFF, scene units: depth_tiff/.
-        channels: Also write a feature channel of the method's Gaussians, for instance albedo.
+        channels: Also write feature channels of the method's Gaussians, for instance albedo.
     """
 
     output: OptionalOutput = None
-    frames: str = "test"
+    frames: Names = ("test",)
     along: Annotated[OptionalPath, tyro.conf.arg(name="path")] = None
     video: Annotated[bool, _flag(help="Do not write trajectory.mp4, rgb beside depth.")] = True
     fps: float = 15.0
     depth_kind: Literal["accumulated", "expected", "median"] = "expected"
     depth_tiff: bool = False
-    channels: Annotated[tuple[str, ...], tyro.conf.arg(name="channel", metavar="NAME"), tyro.conf.UseAppendAction] = ()
+    channels: Names = ()
     overwrite: Overwrite = False
 
 
@@ -323,9 +313,9 @@ class CompareOptions(Options):
     seeds: int = 1
     protocol: str = "paper"
     steps: OptionalInt = None
-    splits: Annotated[tuple[str, ...], tyro.conf.arg(metavar="SPLIT...")] = ()
+    splits: Names = ()
     reference: OptionalText = None
-    primary: Annotated[tuple[str, ...], tyro.conf.arg(metavar="METRIC...")] = ()
+    primary: Names = ()
     jobs: OptionalInt = None
     threads: OptionalInt = None
     executor: Annotated[str, tyro.conf.arg(metavar="local|ray")] = "local"
@@ -337,30 +327,23 @@ class CompareOptions(Options):
 
 
 @dataclass(frozen=True)
-class AblateOptions(CompareOptions):
-    """Options of an ablation: as of a comparison, with ``ablation`` as the default output folder."""
-
-    output: Output = Path("ablation")
-
-
-@dataclass(frozen=True)
 class ReportOptions(Options):
     """Options of a report.
 
     Args:
         output: File to write; with several formats, its suffix is replaced by that of each; default: report.html, .md,
             ...
-        methods: Names of methods to show, in this order, separated by commas; default: all. Tests count the others too.
-        columns: Metrics to show, separated by commas, or `all`; default: psnr,psnr_gain_fitted,ssim,lpips,depth_mse,
-            depth_mse_inner,depth_median_error.
+        methods: Methods to show, in this order; default: all. Tests count the others too.
+        columns: Metrics to show, or all; default: psnr psnr_gain_fitted ssim lpips depth_mse depth_mse_inner
+            depth_median_error.
         reference: Method that the others are compared with; default: coliags, or the best where it is not there.
         protocol: Evaluation protocol to read; NAME-truth: evaluations by `coliags eval RUN --truth SCENE`.
         frames: Held-out frames to show per scene and test set; the worst ones are added.
         title: Heading; default: methods and scenes.
         note: A remark shown at the top.
         scene: Run folder whose scene the HTML page lets its reader fly through, offline; needs the extra `viewer`.
-        formats: What to write, repeatable: html (default), markdown, latex (booktabs), csv (every frame), json
-            (tables), all.
+        formats: Files to write: html, markdown, latex (booktabs), csv (every frame), json (tables) or all of them;
+            text: print the tables.
     """
 
     output: OptionalOutput = None
@@ -373,10 +356,9 @@ class ReportOptions(Options):
     note: OptionalText = None
     scene: OptionalPath = None
     formats: Annotated[
-        tuple[Literal["html", "markdown", "latex", "csv", "json", "all"], ...],
-        tyro.conf.arg(name="format"),
-        tyro.conf.UseAppendAction,
-    ] = ()
+        tuple[Literal["html", "markdown", "latex", "csv", "json", "all", "text"], ...], tyro.conf.arg(name="format")
+    ] = ("html",)
+    overwrite: Overwrite = False
 
 
 @dataclass(frozen=True)

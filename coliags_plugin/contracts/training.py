@@ -172,7 +172,7 @@ class LossSettings(Settings):
     final_weight: float | None = None  # factor at the last step, approached log-linearly; null: constant weight
     min_weight: float = Option(default=0.0, ge=0.0)  # lower bound of the decaying weight
     from_step: int = Option(default=0, ge=0)  # the term is active after this step
-    until_step: int | None = Option(default=None, ge=1)  # and up to this one; null: to the end
+    until_step: int | None = Option(default=None, ge=1)  # the term is active up to this step; null: to the end
 
     @model_validator(mode="after")
     def _ends_above_zero(self) -> Self:

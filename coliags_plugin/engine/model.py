@@ -250,7 +250,7 @@ def _check_points_in_view(config: MethodConfig, scene: Scene) -> None:
     raise InputError(
         f"{problem}, and nothing nearer than {near:g} is drawn",
         "lengths in mm, and poses and points of one world",
-        "`coliags data check` looks into poses, depth and units; small units on purpose need `near_plane=LENGTH`",
+        "`coliags check data` looks into poses, depth and units; small units on purpose need `near_plane=LENGTH`",
     )
 
 

@@ -15,7 +15,7 @@ from torch import Tensor
 from coliags_plugin.config.options import RenderOptions
 from coliags_plugin.config.yaml_tree import dump, tuples
 from coliags_plugin.core.cameras import Camera
-from coliags_plugin.core.errors import check_name
+from coliags_plugin.core.errors import InputError, check_name, did_you_mean
 from coliags_plugin.core.files import atomic_folder, atomic_write, write_json
 from coliags_plugin.core.json_files import read_json
 from coliags_plugin.core.render_output import OPAQUE_ALPHA, RenderOutput
@@ -42,7 +42,7 @@ _WANTS = ("rgb", "alpha", "depth_accumulated")
 
 
 def render_run(trained: TrainedRun, options: RenderOptions) -> Path:
-    """Render colour, depth and error images of a set of frames, and a video along the trajectory.
+    """Render colour, depth and error images of frames, and, unless some are named singly, a video of the trajectory.
 
     A relit run has its light in ``lamp.yaml``, and no colour errors, there being no images in that light. Depth, of one
     of the kinds of docs/conventions.md 3, is hatched where alpha is below 0.5, and has no errors where the scene's own
@@ -59,13 +59,14 @@ def render_run(trained: TrainedRun, options: RenderOptions) -> Path:
     depth = f"depth_{options.depth_kind}"
     wants, unit = ("rgb", "alpha", depth), trained.scene.length_unit
     trained.model.check_outputs(wants, f"depth of kind '{options.depth_kind}'")
-    path: Sequence[Frame | Camera] = choose_frames(trained.scene, "all")
+    path: Sequence[Frame | Camera] = trained.scene.video
     if along is not None:
         path = list(along.cameras(trained.scene.train[0].camera, options.fps))
+    video = options.video and (along is not None or frame_sets(trained.scene).keys() >= {*options.frames})
     limits = sampled_depth_limits(trained, chosen or path, depth)
     with (
         atomic_folder(output, options.overwrite) as folder,
-        ProgressReport("render", len(chosen) + len(path) * options.video) as progress,
+        ProgressReport("render", len(chosen) + len(path) * video) as progress,
     ):
         for count, frame in enumerate(chosen, start=1):
             view = render_view(trained, frame, (*wants, *channels))
@@ -83,7 +84,7 @@ def render_run(trained: TrainedRun, options: RenderOptions) -> Path:
         for light in (trained.lamp, trained.held):
             if light is not None:
                 atomic_write(folder / "lamp.yaml", dump(light.described))
-        if options.video:
+        if video:
             name = "trajectory.mp4" if along is None else "path.mp4"
             write_video(_film(trained, path, depth, limits, progress, len(chosen)), folder / name, options.fps)
     return output
@@ -101,11 +102,21 @@ def error_limit_of(trained: TrainedRun) -> float:
     return DEPTH_ERROR_LIMIT_MM / trained.model.scale
 
 
-def choose_frames(scene: Scene, frames: str) -> list[Frame]:
-    """Frames of a scene: ``train``, ``all`` (train and test in video order), or those of a test set by its name."""
-    groups = {"train": scene.train, **scene.test_sets, "all": scene.video}
-    check_name("set of frames", frames, [name for name, group in groups.items() if group])
-    return groups[frames]
+def frame_sets(scene: Scene) -> dict[str, list[Frame]]:
+    """Sets of frames that are not empty: ``train``, every test set, and ``all`` (train and test in video order)."""
+    sets = {"train": scene.train, **scene.test_sets, "all": scene.video}
+    return {name: frames for name, frames in sets.items() if frames}
+
+
+def choose_frames(scene: Scene, names: Sequence[str]) -> list[Frame]:
+    """Frames of a scene by names of sets (:func:`frame_sets`) or of single frames, each frame once."""
+    sets = frame_sets(scene)
+    named = {frame.name: [frame] for frames in sets.values() for frame in frames} | sets
+    for name in names:
+        if name not in named:
+            expected = f"{', '.join(sets)}, or the name of a frame such as {scene.train[0].name}"
+            raise InputError(f"scene '{scene.name}' has no frame '{name}'", expected, did_you_mean(name, named))
+    return [*{frame.name: frame for name in names for frame in named[name]}.values()]
 
 
 @torch.no_grad()

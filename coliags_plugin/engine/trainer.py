@@ -15,7 +15,7 @@ from typing import Any, Literal
 
 import torch
 
-from coliags_plugin.config.method_config import LoadedMethod, method_name
+from coliags_plugin.config.method_config import LoadedMethod, default_rates, method_name
 from coliags_plugin.config.options import TrainOptions
 from coliags_plugin.contracts import Draw, Field, Follower, Loss, Sampler, Schedule, Strategy, TrainingStep
 from coliags_plugin.core.errors import (
@@ -27,6 +27,7 @@ from coliags_plugin.core.errors import (
 )
 from coliags_plugin.core.files import atomic_write
 from coliags_plugin.core.json_files import JsonObject
+from coliags_plugin.core.registry import REGISTRIES
 from coliags_plugin.core.render_output import BLANK_ALPHA, RenderOutput, concatenate_pixels
 from coliags_plugin.core.scenes import Frame, Scene, Target, View, concatenate_targets
 from coliags_plugin.core.tensors import masked_mean, sent
@@ -126,7 +127,7 @@ class Trainer:
         cost = None if saved is None else self._restore(saved)
         self.run.record_schedule(self.method.config, self.step, self.strategy.plan())
         if self.step < self.steps:
-            self.run.record_code(self.step)
+            self.run.record_code(self.step, self._plugins())
         self._cut_log()
         self.costs = CostMeter(self.device, cost)
         logger.info("resuming %s at step %d of %d", self.run.path, self.step, self.steps)
@@ -266,6 +267,7 @@ class Trainer:
             "renderer_reason": self.chosen.reason,
             "untrained_views": {name: module.untrained_views for name, module in self.model.view_modules.items()},
             **software(),
+            **({"plugins": plugins} if (plugins := self._plugins()) else {}),
             "scene": {
                 "name": scene.name,
                 "path": self.run.relative(self.scene_path),
@@ -278,6 +280,12 @@ class Trainer:
             "plan": self.strategy.plan(),
         }
 
+    def _plugins(self) -> dict[str, JsonObject]:
+        """Origins of the components of other packages and files, by ``kind.name``."""
+        used = sorted({*self.method.config.components(), ("renderers", self.chosen.name)})
+        plugins = ((kind, name) for kind, name in used if REGISTRIES[kind].source(name) != "built in")
+        return {f"{kind}.{name}": REGISTRIES[kind].origin(name) for kind, name in plugins}
+
     def _out_of_memory(self, error: torch.OutOfMemoryError) -> DeviceMemoryError:
         count, first = self.model.field.element_count, str(error).partition("\n")[0]
         at = f"step {self.step + 1}, {count:,} elements: the memory of {self.device} ran out"
@@ -289,7 +297,7 @@ class Trainer:
             raise NothingDrawnError(
                 f"nothing was drawn in the last {MAX_BLANK_VIEWS} views, until step {step}: their mean alpha is below "
                 f"{BLANK_ALPHA:g}. Checkpoints stay whole. Learning rates or weights of losses may be too large, or "
-                f"near_plane {self.method.config.near_plane:g} may lie beyond the tissue; `coliags data check` looks "
+                f"near_plane {self.method.config.near_plane:g} may lie beyond the tissue; `coliags check data` looks "
                 "into poses and units."
             )
 
@@ -305,7 +313,11 @@ class Trainer:
         return frames
 
     def _optimizers(self) -> Optimizers:
-        return Optimizers(self.model, self.method.config.optimizers, self.steps, self.scene.extent)
+        """Optimizers of the model's groups; defaults of groups that a component leaves out are not used."""
+        config, groups = self.method.config, self.model.parameter_groups()
+        unused = default_rates(config.field, config.modules).keys() - groups.keys()
+        rates = {group: each for group, each in config.optimizers.items() if group not in unused}
+        return Optimizers(self.model, rates, self.steps, self.scene.extent)
 
     def _cut_log(self) -> None:
         """Remove log rows of steps after the checkpoint, which will be repeated."""
@@ -416,6 +428,7 @@ def open_training(
         overrides, data_format = ((), None) if if_exists == "continue" else (options.overrides, options.data_format)
         name = method_name(run_name or options.method)
         folder.check_method(name)
+        folder.check_plugins()
         # The config stored in the run, even if that of this name has changed since.
         method = load_method_for(options.data, str(folder.config_file.resolve()), overrides, data_format)
         method = replace(method, name=name)

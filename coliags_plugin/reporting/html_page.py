@@ -79,6 +79,11 @@ def refuse_folder(output: Path) -> None:
         raise InputError(f"{output} is a folder", "a file", f"Write to {output / 'report.html'}")
 
 
+def pictures_folder(output: Path) -> Path:
+    """Folder of the pictures that a page has no room for."""
+    return output.with_name(f"{output.stem}_files")
+
+
 class _Writer:
     """Writer of blocks and figures by the macros that ``blocks.html`` has of their kinds; collects their pictures."""
 
@@ -107,7 +112,7 @@ class _Writer:
 def _with_pictures(text: str, pictures: dict[str, EncodedImage], output: Path | None = None, limit: int = 0) -> str:
     """A text with the addresses of its pictures: data URIs while there is room, then files beside the output."""
     room = limit - len(text.encode()) - _NOTE_ROOM
-    folder = None if output is None else output.with_name(f"{output.stem}_files")
+    folder = None if output is None else pictures_folder(output)
     beside: dict[str, str] = {}
 
     def address(match: re.Match[str]) -> str:

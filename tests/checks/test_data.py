@@ -305,7 +305,7 @@ def test_features_are_matched_at_the_stored_size(frames, tmp_path, capsys, caplo
     write_frames(tmp_path / "tube", frames[:12], depth=False)
     size = ("--set", "width=40", "--set", "datamanager.height=32")  # with and without the prefix
     with caplog.at_level(logging.INFO):
-        status = run("data", "check", tmp_path / "tube", *size)
+        status = run("check", "data", tmp_path / "tube", *size)
     out, log = capsys.readouterr().out, [record.getMessage() for record in caplog.records]
     assert status == 0
     assert "40 x 32 px, stored 160 x 128" in out
@@ -318,7 +318,7 @@ def test_features_are_matched_at_the_stored_size(frames, tmp_path, capsys, caplo
 @pytest.mark.thorough
 @pytest.mark.parametrize(("name", "step"), [("colmap_23img", 1), ("c3vd_cecum_t1_a", 16)])
 def test_real_scenes_are_not_suspected(shared_data, capsys, name, step):
-    assert run("data", "check", shared_data / name, "--set", "max_frames=4", "--set", f"frame_step={step}") == 0
+    assert run("check", "data", shared_data / name, "--set", "max_frames=4", "--set", f"frame_step={step}") == 0
     assert "nothing suspect" in capsys.readouterr().out
 
 
@@ -354,7 +354,7 @@ def test_where_features_fail_points_are_followed(unmatched):
 
 def test_a_scene_without_dense_depth_is_to_be_given_it(unmatched, monkeypatch, capsys):
     monkeypatch.setattr("coliags_plugin.engine.data_formats.open_scene", lambda *arguments, **options: unmatched)
-    assert run("data", "check", "SCENE", "--set", "split=block") == 0
+    assert run("check", "data", "SCENE", "--set", "split=block") == 0
     expected = depth_commands(Path("SCENE"), ["--set", "split=block"], training_options(unmatched))
     assert capsys.readouterr().out.splitlines()[-2:] == [f"next:    {command}" for command in expected]
 
@@ -410,7 +410,7 @@ def test_another_calibration_of_endogslams_data_is_not_suspected(tmp_path):
 
 @pytest.mark.thorough
 def test_command_says_it_all(folder, scene, tmp_path, capsys):
-    argv = ("data", "check", folder, "--html", tmp_path / "check.html")
+    argv = ("check", "data", folder, "--html", tmp_path / "check.html")
     assert run(*argv) == 0
     out = capsys.readouterr().out
     assert "nothing suspect" in out
@@ -429,7 +429,7 @@ def test_command_says_it_all(folder, scene, tmp_path, capsys):
 def test_command_fails_on_what_is_suspect(scene, tmp_path, capsys):
     inverted = changed(scene, pose=torch.linalg.inv)
     write_frames(tmp_path / "inverted", inverted.video)
-    assert run("data", "check", tmp_path / "inverted") == 1
+    assert run("check", "data", tmp_path / "inverted") == 1
     assert "Suspect\nposes agree with depth when read as: world-to-camera: " in capsys.readouterr().out
-    assert run("data", "check", tmp_path / "inverted", "--json") == 1
+    assert run("check", "data", tmp_path / "inverted", "--json") == 1
     assert json.loads(capsys.readouterr().out)["suspect"] is True

@@ -103,6 +103,13 @@ def test_render_writes_images_scales_a_video_and_depth_as_numbers(trained, tmp_p
         assert (out / f"{scale}.png").is_file()
 
 
+def test_single_frames_are_rendered_without_a_video(trained, tmp_path):
+    assert run("render", trained, "--frames", "0003_color", "test", "0008_color", "--output", tmp_path / "out") == 0
+    names = [path.stem for path in sorted((tmp_path / "out/rgb").iterdir())]
+    assert names == ["0000_color", "0003_color", "0008_color", "0016_color"]
+    assert not (tmp_path / "out/trajectory.mp4").exists()
+
+
 def test_eval_shows_the_expected_depth(trained):
     folder, handle = trained / "eval" / "paper", load_run(trained, device="cpu")
     assert (folder / "depth_pictures" / "scale.png").is_file()
@@ -155,17 +162,18 @@ def test_default_run_folder_and_resume_of_the_newest(scene, tmp_path, monkeypatc
     assert (printed / "checkpoints" / "step-000002").is_dir()
 
 
-def test_list_and_config_and_doctor_and_a_dry_run_of_an_ablation(scene, tmp_path, capsys):
-    argv = ("ablate", "embedding-sizes", "--scenes", scene, "--output", tmp_path / "new", "--dry-run")
+def test_list_and_config_and_the_installation_and_a_dry_run_of_an_ablation(scene, tmp_path, capsys):
+    argv = ("compare", "embedding-sizes", "3dgs", "--scenes", scene, "--output", tmp_path / "new", "--dry-run")
     assert run(*argv) == 0
-    assert "seed 0" in capsys.readouterr().out and not any(tmp_path.iterdir())
+    planned = capsys.readouterr().out
+    assert "wall 5-5 seed 0" in planned and "wall 3dgs seed 0" in planned and not any(tmp_path.iterdir())
     assert run("list", "methods") == 0
     assert "scaffold-gs-depth" in capsys.readouterr().out
     assert run("list") == 0
     assert "renderers:" in capsys.readouterr().out
-    assert run("config", "show", "coliags", "--origin") == 0
+    assert run("config", "coliags", "--origin") == 0
     assert "frequencies: 10  # coliags.yaml:" in capsys.readouterr().out
-    assert run("doctor") == 0
+    assert run("check", "installation") == 0
     assert "would use cpu" in capsys.readouterr().out
 
 
@@ -189,7 +197,9 @@ def test_list_and_config_and_doctor_and_a_dry_run_of_an_ablation(scene, tmp_path
         ("eval .", "not a run folder"),
         ("eval RUN --protocol papper", "Did you mean 'paper'"),
         ("render .", "not a run folder"),
-        ("render RUN --frames rotation", "one of train, test, all"),
+        ("render RUN --frames rotation", "Expected train, test, all, or the name of a frame such as 0001_color"),
+        ("render RUN --frames test 0002_colour", "Did you mean '0002_color'"),
+        ("compare paper-row --scenes SCENE", "Did you mean 'paper-rows'"),
         ("list renderer", "Did you mean 'renderers'"),
     ],
 )
@@ -308,7 +318,7 @@ def test_home_folder(tmp_path, janes, monkeypatch, capsys):
     (tmp_path / "base.yaml").write_text("base: scaffold-gs\n")
     (tmp_path / "own.yaml").write_text("base: ~/base.yaml\n")
     points = ("initial_points=file", "points_file=~/Jane Doe/points.ply")
-    assert run("data", "check", f"{home}/scene", "--html=~/page.html", "--set", points[0], "--set", points[1]) in (0, 1)
+    assert run("check", "data", f"{home}/scene", "--html=~/page.html", "--set", points[0], "--set", points[1]) in (0, 1)
     assert (tmp_path / "page.html").is_file() and "points.ply" in capsys.readouterr().out
     trained = train("~/own.yaml", f"{home}/scene", output="~/run", steps=1, renderer="torch", settings=SMALL)
     assert trained.path == tmp_path / "run" == Run("~/run").path and (tmp_path / "run/config.yaml").is_file()
@@ -316,12 +326,12 @@ def test_home_folder(tmp_path, janes, monkeypatch, capsys):
         report("~/run")  # was not evaluated
     (tmp_path / "bench.yaml").write_text("description: One scene\nscenes:\n  wall: {folder: ~/Jane Doe/scene}\n")
     assert [str(source.path) for source in find_scenes(["~/bench.yaml"], None)] == [str(janes)]
-    refused(capsys, "data", "check", "~nobody-of-this-name/scene")
+    refused(capsys, "check", "data", "~nobody-of-this-name/scene")
 
 
 def test_of_checks(tmp_path, janes, capsys):
     out = tmp_path / "out"
-    assert run("data", "check", janes, "--html", out / "check.html", "--json") in (0, 1)
+    assert run("check", "data", janes, "--html", out / "check.html", "--json") in (0, 1)
     printed = json.loads(capsys.readouterr().out)
     summary = json.dumps({key: value for key, value in printed.items() if key not in ("written", "next")})
     assert "Jane Doe" not in summary and str(tmp_path) not in summary

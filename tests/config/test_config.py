@@ -67,7 +67,7 @@ def test_methods_that_differ_in_one_option_of_the_appearance_head_alone(method, 
     assert first.pop("description") != second.pop("description")
     assert tuple(config["field"]["appearance_head"].pop(option) for config in (first, second)) == values
     assert first == second
-    assert f"bias_init: scene_distances  # {method}.yaml:" in load_method(method).with_origins()
+    assert f"bias_init: scene_distances  # {method}.yaml:" in load_method(method).annotated()
 
 
 @pytest.mark.parametrize(
@@ -130,7 +130,7 @@ def test_files_and_overrides_change_what_they_inherit(method_file, text, overrid
 
 
 def test_origins_name_file_and_line_or_the_option():
-    text = load_method("coliags", ["field.geometry_head.frequencies=8"]).with_origins()
+    text = load_method("coliags", ["field.geometry_head.frequencies=8"]).annotated()
     for part in ("# scaffold-gs.yaml:", "# coliags.yaml:", "# default", "# `field.geometry_head.frequencies=8`"):
         assert part in text
     assert yaml.safe_load(text)["field"]["geometry_head"]["frequencies"] == 8

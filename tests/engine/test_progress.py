@@ -101,7 +101,7 @@ def test_tensorboard_reads_what_the_log_has(tmp_path):
     row = {"step": 3, "loss": 1, "terms": {"l1": 0.5}, "grown": "none", "psnr": 20.0}
     assert scalars(row) == {"loss": 1.0, "psnr": 20.0, "terms/l1": 0.5}
     argv = ("train", "coliags", "--data", write_wall(tmp_path / "wall"), "--output", tmp_path / "run", *SETS)
-    assert run(*argv, "--steps", 4, "--logger", "tensorboard", "--set", "schedule.log_every=1") == 0
+    assert run(*argv, "--steps", 4, "--loggers", "tensorboard", "--set", "schedule.log_every=1") == 0
     rows = [json.loads(line) for line in (tmp_path / "run/metrics.jsonl").read_text().splitlines()]
     scalars_by_step = logged(tmp_path / "run")
     assert scalars_by_step.keys() == scalars(rows[0]).keys()
@@ -150,7 +150,7 @@ def test_followers_change_nothing_and_end_nothing(tmp_path, caplog):
 def test_a_missing_library_is_told_before_anything_is_written(tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "wandb", None)
     argv = ("train", "coliags", "--data", write_wall(tmp_path / "wall"), "--output", tmp_path / "run")
-    assert "pip install 'coliags_plugin[loggers]'" in refused(capsys, *argv, "--logger", "wandb")
+    assert "pip install 'coliags_plugin[loggers]'" in refused(capsys, *argv, "--loggers", "wandb")
     assert not (tmp_path / "run").exists()
     with pytest.raises(InputError, match=r"no logger 'tensorbord'.*Did you mean 'tensorboard'"):
         find_loggers(["tensorbord"])

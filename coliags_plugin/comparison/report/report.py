@@ -5,6 +5,7 @@ from __future__ import annotations
 from base64 import b64encode
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from coliags_plugin.comparison.report.charts import frame_charts, profile_section, training_section
@@ -23,9 +24,9 @@ from coliags_plugin.comparison.report.metric_tables import (
 from coliags_plugin.comparison.report.study import MissingResult, Study, StudyRun, cautions, grouped, read_study
 from coliags_plugin.comparison.report.views import view_section
 from coliags_plugin.config.options import ReportOptions
-from coliags_plugin.core.errors import check_name
-from coliags_plugin.core.files import atomic_write, write_json
-from coliags_plugin.reporting.html_page import refuse_folder, write_html
+from coliags_plugin.core.errors import InputError, check_name
+from coliags_plugin.core.files import atomic_write, refuse_existing, write_json
+from coliags_plugin.reporting.html_page import pictures_folder, refuse_folder, write_html
 from coliags_plugin.reporting.model import (
     Block,
     Column,
@@ -42,30 +43,49 @@ from coliags_plugin.reporting.model import (
     record,
 )
 from coliags_plugin.reporting.numbers import counted
-from coliags_plugin.reporting.text_formats import latex_text, markdown_text, page_values
+from coliags_plugin.reporting.text_formats import latex_text, markdown_text, page_text, page_values
 from coliags_plugin.results.reading import csv_text, frame_rows
+from coliags_plugin.results.record import Result
 
 _TIMES = "\N{MULTIPLICATION SIGN}"
 #: Scenes listed by name; of more, only their number is given.
 _LISTED = 12
 
-#: Formats with their suffixes.
+#: Formats of files with their suffixes.
 SUFFIXES = {"html": ".html", "markdown": ".md", "latex": ".tex", "csv": ".csv", "json": ".json"}
 
 
-def write_report(paths: Sequence[Path], options: ReportOptions, scene: Section | None = None) -> list[Path]:
+@dataclass(frozen=True)
+class WrittenReport:
+    """A report of results: its files; ``print`` shows it as text, without figures."""
+
+    files: list[Path]
+    results: list[Result]
+    page: Page
+
+    def __str__(self) -> str:
+        """The page as text."""
+        return page_text(self.page)
+
+
+def write_report(paths: Sequence[Path], options: ReportOptions, scene: Section | None = None) -> WrittenReport:
     """Write a report of run folders, results files and folders of comparisons.
 
-    Returns the files: the output, replaced if it is there, or that with the suffix of each of several formats. CSV has
-    every metric of every frame, JSON the tables. The scene to fly through is of the HTML page alone.
+    Files are the output, or that with the suffix of each of several formats. CSV has every metric of every frame, JSON
+    the tables. The scene to fly through is of the HTML page alone.
     """
     for name in options.formats:
-        check_name("format", name, (*SUFFIXES, "all"))
-    formats = [*SUFFIXES] if "all" in options.formats else [*dict.fromkeys(options.formats or ("html",))]
-    output = options.output or Path(f"report{SUFFIXES[formats[0]]}")
-    files = {each: output if len(formats) == 1 else output.with_suffix(SUFFIXES[each]) for each in formats}
+        check_name("format", name, (*SUFFIXES, "all", "text"))
+    formats = [each for each in SUFFIXES if not {each, "all"}.isdisjoint(options.formats)]
+    if not formats and (options.output is not None or not options.formats):
+        raise InputError("no format of files", f"{', '.join(SUFFIXES)} or all; or, without `output`, text")
+    output = options.output or Path("report")
+    is_whole = options.output is not None and len(formats) == 1
+    files = {each: output if is_whole else output.with_suffix(SUFFIXES[each]) for each in formats}
     for file in files.values():
         refuse_folder(file)
+    for place in [*files.values(), *(pictures_folder(file) for each, file in files.items() if each == "html")]:
+        refuse_existing(place, options.overwrite, "a new file")
     study = read_study(paths, options.protocol, options.methods)
     page = report_page(study, options, screen="html" in files, scene=scene)
     for each, file in files.items():
@@ -78,7 +98,7 @@ def write_report(paths: Sequence[Path], options: ReportOptions, scene: Section |
                 write_json(file, page_values(page))
             case _:
                 atomic_write(file, latex_text(page) if each == "latex" else markdown_text(page))
-    return [*files.values()]
+    return WrittenReport([*files.values()], [run.result for run in study.runs], page)
 
 
 def report_page(study: Study, options: ReportOptions, screen: bool = False, scene: Section | None = None) -> Page:
@@ -129,7 +149,7 @@ def _metrics(study: Study, options: ReportOptions, reference: str) -> Section:
     if len(study.scenes) > 1:
         text = "Means over the scenes of each set, of each the mean over its frames."
     text += " ↑ higher is better, ↓ lower is better."
-    if len(study.methods) > 1:
+    if len(study.methods) > 1 and {*options.formats} != {"text"}:
         text += " Best in bold, second underlined, by the printed digits; equal values share a rank."
     blocks: list[Block] = [Paragraph(text)]
     for test_set in study.test_sets:

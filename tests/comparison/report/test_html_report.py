@@ -20,6 +20,7 @@ from coliags_plugin.config.options import ReportOptions
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.reporting.colormaps import color_table, hatch
 from coliags_plugin.reporting.image_files import EncodedImage, write_depth_tiff
+from tests.commands import refused, run
 from tests.comparison.report.made import (
     FRAMES,
     HEIGHT,
@@ -77,7 +78,7 @@ class Page(HTMLParser):
 
 def report(tmp_path, paths, **options):
     output = tmp_path / "out" / "report.html"
-    write_report(paths, ReportOptions(output, **options))
+    write_report(paths, ReportOptions(output, overwrite=True, **options))
     return Page(output.read_text(encoding="utf-8"))
 
 
@@ -259,8 +260,8 @@ def test_long_logs_are_drawn_through_means_one_curve_for_each_seed(tmp_path):
         assert text in page.words
     drawn = [attributes["d"] for attributes in page.all("path") if attributes["class"] == "line"]
     assert [path.count("L") for path in drawn].count(119) == 8
-    for run in runs:
-        (run / "metrics.jsonl").unlink()
+    for folder in runs:
+        (folder / "metrics.jsonl").unlink()
     assert "No training log" in report(tmp_path, runs).words
 
 
@@ -300,7 +301,8 @@ def test_every_scene_of_a_comparison_is_folded(tmp_path):
 
 
 def test_formats(tmp_path, two_runs):
-    files = write_report(two_runs, ReportOptions(tmp_path / "out/tables.html", formats=("all",)))
+    written = write_report(two_runs, ReportOptions(tmp_path / "out/tables.html", formats=("all", "text")))
+    files = written.files
     assert [file.name for file in files] == [f"tables.{kind}" for kind in ("html", "md", "tex", "csv", "json")]
     _, markdown, latex, table, values = (file.read_text() for file in files)
     assert markdown.startswith("# 2 methods compared on cecum") and r"\toprule" in latex
@@ -308,9 +310,39 @@ def test_formats(tmp_path, two_runs):
     values = json.loads(values)
     (summary, _) = values["sections"][0]["tables"]
     assert [(row["method"], row["psnr"]) for row in summary["rows"]] == [("coliags", 32.0), ("3dgs", 30.0)]
-    assert write_report(two_runs, ReportOptions(tmp_path / "table.txt", formats=("markdown",))) == [
-        tmp_path / "table.txt"
-    ]
+    assert [result.method for result in written.results] == ["coliags", "3dgs"]
+    assert re.search(r"\ncoliags +32.00.*\n3dgs +30.00", str(written))
+    one_format = ReportOptions(tmp_path / "table.txt", formats="markdown")
+    assert write_report(two_runs, one_format).files == [tmp_path / "table.txt"]
+
+
+def test_text_is_printed_and_json_has_the_results_whatever_the_format(two_runs, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    before = sorted(tmp_path.rglob("*"))
+    assert run("report", *two_runs, "--format", "text", "--columns", "psnr", "ssim") == 0
+    printed = capsys.readouterr().out
+    assert re.search(r"^coliags +32.00", printed, re.MULTILINE) and "written" not in printed
+    assert run("report", *two_runs, "--format", "text", "--json") == 0
+    values = json.loads(capsys.readouterr().out)
+    assert [(result["method"], result["psnr"]) for result in values["results"]] == [("coliags", 32.0), ("3dgs", 30.0)]
+    assert values["written"] == [] and values["results"][0]["facts"]["seed"] == "0"
+    for words in (("--format", "text", "-o", "x.txt"), ("--format",)):
+        assert "no format of files" in refused(capsys, "report", *two_runs, *words)
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_nothing_is_replaced_unless_asked_for(two_runs, tmp_path, capsys):
+    out = tmp_path / "out"
+    argv = ("report", two_runs[0], "--output", out / "r.html", "--format", "html", "csv")
+    assert run(*argv) == 0
+    for name in ("r.csv", "r_files/a.png"):
+        for file in out.glob("r.*"):
+            file.unlink()
+        (out / name).parent.mkdir(exist_ok=True)
+        (out / name).write_text("former")
+        assert f"{out / name.split('/')[0]} already exists" in refused(capsys, *argv)
+        assert [file.name for file in out.glob("r.*")] == [name] * (name == "r.csv")
+    assert run(*argv, "--overwrite") == 0 and "cecum" in (out / "r.csv").read_text()
 
 
 # Refusals

@@ -274,11 +274,11 @@ def test_what_cannot_be_saved(run_of, tmp_path, capsys):
 
 def test_a_report_embeds_a_scene(anchors, tmp_path):
     anchors.evaluate()
-    (page,) = cp.report(anchors, tmp_path / "report.html", scene=anchors)
+    (page,) = cp.report(anchors, tmp_path / "report.html", scene=anchors).files
     text = page.read_text(encoding="utf-8")
     (embedded,) = re.findall(r'<iframe title="coliags on wall, seed 0" [^>]*data-page="([^"]*)"', text)
     assert 'id="scene"' in unescape(embedded) and "<title>coliags on wall</title>" in unescape(embedded)
-    (plain,) = cp.report(anchors, tmp_path / "plain.html")
+    (plain,) = cp.report(anchors, tmp_path / "plain.html").files
     assert "<iframe" not in plain.read_text(encoding="utf-8")
 
 
