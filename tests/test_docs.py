@@ -21,6 +21,7 @@ from coliags_plugin.cli.checks import CheckMethodCommand
 from coliags_plugin.cli.methods import ConfigCommand
 from coliags_plugin.cli.runs import TrainCommand
 from coliags_plugin.cli.scenes import PhantomCommand
+from coliags_plugin.cli.texts import depth_commands
 from coliags_plugin.config.method_config import MethodConfig, OptimizerSettings, ScheduleSettings, load_method
 from coliags_plugin.config.reference import meanings, type_text
 from coliags_plugin.core.registry import REGISTRIES
@@ -141,6 +142,13 @@ def commands() -> list[tuple[str, str]]:
         lines += re.findall(r"`(coliags [^`]+)`", prose)
         typed += [(name_of(page), line.strip()) for line in lines if re.match(r"(\w+=\S+ +)*coliags ", line.strip())]
     return typed
+
+
+@pytest.mark.parametrize("page", ["../README.md", "data.md", "depth.md", "poses.md", "layouts/c3vd-v2.md"])
+def test_pages_tell_the_same_way_to_depth_as_messages(page):
+    lines = [re.sub(r" +#.*", "", line) for block in fenced(DOCS / page, "sh") for line in block.splitlines()]
+    first, second = depth_commands(Path("SCENE"))
+    assert first in lines and second in lines
 
 
 #: Commands that running text names alone.

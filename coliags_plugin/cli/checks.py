@@ -14,7 +14,7 @@ from typing import Annotated
 
 import tyro
 
-from coliags_plugin.cli.texts import in_flags, print_summary, train_command
+from coliags_plugin.cli.texts import depth_commands, in_flags, print_summary, train_command
 from coliags_plugin.config import options
 
 
@@ -92,6 +92,7 @@ class CheckDataCommand:
         from coliags_plugin.checks.data.page import check_page, verdict
         from coliags_plugin.engine.data_formats import open_scene
         from coliags_plugin.engine.progress import progress_callback
+        from coliags_plugin.reconstruction.depth.scene import training_options
         from coliags_plugin.reporting.html_page import write_html
         from coliags_plugin.reporting.text_formats import page_text
 
@@ -104,12 +105,16 @@ class CheckDataCommand:
             write_html(page, self.html)
         chosen = [f"datamanager.{key.removeprefix('datamanager.')}" for key in self.set]
         chosen += [] if self.data_format is None else [f"datamanager.name={self.data_format}"]
-        is_ready = check.facts["depth"] is not None and not check.findings
+        reading = [word for item in self.set for word in ("--set", item)]
+        reading += [] if self.data_format is None else ["--data-format", self.data_format]
+        then = [train_command(self.scene, chosen)]
+        if check.facts["depth"] is None:
+            then = depth_commands(self.scene, reading, training_options(scene))
         print_summary(
             f"{page_text(page)}\n\n{verdict(check)}",
             check.as_json(),
             written=[] if self.html is None else [self.html],
-            then=[train_command(self.scene, chosen)] if is_ready else [],
+            then=[] if check.findings else then,
             as_json=self.json,
         )
         if check.findings:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from coliags_plugin.cli.texts import coliags, parse_size, print_summary, train_command, view_command
+from coliags_plugin.cli.texts import coliags, depth_commands, parse_size, print_summary, train_command, view_command
 from coliags_plugin.config import options
 from coliags_plugin.core.errors import InputError
 
@@ -55,6 +55,7 @@ class PhantomCommand:
         """Generate the dataset."""
         from coliags_plugin.api.scenes import make_phantom
         from coliags_plugin.config.yaml_tree import parse_assignments
+        from coliags_plugin.core.registry import phantom_layouts
 
         names = ("preset", "trajectory", "frames", "light", "gain", "rotation_views")
         values = {name: getattr(self, name) for name in names}
@@ -64,7 +65,8 @@ class PhantomCommand:
             options["width"], options["height"] = parse_size(self.size)
         options |= parse_assignments(self.set)
         folder = make_phantom(self.output, **options)
-        print_summary(facts={"settings": options}, written=[folder], then=[train_command(folder)], as_json=self.json)
+        then = depth_commands(folder) if phantom_layouts.get(self.layout).has_points else [train_command(folder)]
+        print_summary(facts={"settings": options}, written=[folder], then=then, as_json=self.json)
 
 
 _OptionalLength = Annotated[float | None, tyro.conf.arg(metavar="LENGTH", help_behavior_hint="")]

@@ -171,9 +171,9 @@ class RenderOptions(Options):
 
     Args:
         output: Folder to create; default RUN/renders, in another light RUN/relit, along a path RUN/path.
-        frames: Sets of frames: train, all, or test sets by name (default: test); or names of single frames.
+        frames: Sets of frames: train, all, or test sets by name (default: test); or single frames by name, no video.
         along: Render only a video along this camera path, a file saved in `coliags view`.
-        video: Also write trajectory.mp4, rgb beside depth; never with single frames.
+        video: Also write trajectory.mp4, rgb beside depth.
         fps: Frames per second of the video.
         depth_kind: Which depth: sum w z, the paper's; the same divided by alpha; or that of the Gaussian at which half
             of the light is absorbed. Pictures are hatched where alpha is below 0.5.
@@ -351,7 +351,7 @@ class ReportOptions(Options):
     columns: Names = ()
     reference: OptionalText = None
     protocol: str = "paper"
-    frames: int = 4
+    frames: int = 2
     title: OptionalText = None
     note: OptionalText = None
     scene: OptionalPath = None

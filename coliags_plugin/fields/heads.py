@@ -80,7 +80,7 @@ class IMVEGeometrySettings(PlainGeometrySettings):
 
 
 class IMVEGeometryHead(PlainGeometryHead[IMVEGeometrySettings]):
-    """Improved geometry Modelling with View Embedding: gamma(v) in place of v (paper, Eq. 7; docs/methods.md 3.4)."""
+    """Improved Geometry Modeling with View Embedding: gamma(v) in place of v (paper, Eq. 7; docs/methods.md 3.4)."""
 
     @property
     def frequencies(self) -> int:
@@ -194,7 +194,7 @@ class IMIAAppearanceSettings(AppearanceSettings):
 
 
 class IMIAAppearanceHead(MLPAppearanceHead[IMIAAppearanceSettings]):
-    """Improved appearance Modelling with Illumination Attenuation (paper, Eq. 8; docs/methods.md 3.4).
+    """Improved Appearance Modeling with Illumination Attenuation (paper, Eq. 8; docs/methods.md 3.4).
 
     The MLP sees v, the distance d to the lamp and gamma(cos theta), the angle to the optical axis in which light
     spread and vignetting merge.

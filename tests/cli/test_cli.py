@@ -17,13 +17,14 @@ import numpy as np
 import pytest
 
 from coliags_plugin import Run, load_run, report, train
+from coliags_plugin.cli.texts import depth_commands, train_command
 from coliags_plugin.comparison.scenes import find_scenes
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import read_rgb
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.core.text_files import without_places
 from coliags_plugin.export.splats.formats import write_splats
-from coliags_plugin.reporting.colormaps import hatch
+from coliags_plugin.reporting.colormaps import colorize_error, depth_error, error_limit, hatch
 from coliags_plugin.reporting.image_files import read_depth_tiff
 from tests.commands import refused, run
 from tests.export.splats.clouds import random_cloud
@@ -94,6 +95,12 @@ def test_render_writes_images_scales_a_video_and_depth_as_numbers(trained, tmp_p
         picture = read_rgb(out / "depth" / f"{name}.png")
         low = view.alpha < 0.5
         assert (picture[low] == hatch(*low.shape)[low]).all()
+    views = [handle.render(name, depth=f"depth_{kind}") for name in handle.frame_names()]
+    errors = [depth_error(view.depth, view.true_depth) for view in views]
+    for view, error in zip(views, errors, strict=True):
+        drawn = colorize_error(error, error_limit(errors))
+        np.testing.assert_array_equal(read_rgb(out / "depth_error" / f"{view.name}.png"), drawn)
+        assert np.median(read_rgb(out / "rgb_error" / f"{view.name}.png")) > 20, "most errors are black"
     for folder in ("rgb", "depth", "rgb_error", "depth_error"):
         images = sorted((out / folder).iterdir())
         assert [path.stem for path in images] == [*handle.frame_names()]
@@ -112,7 +119,7 @@ def test_single_frames_are_rendered_without_a_video(trained, tmp_path):
 
 def test_eval_shows_the_expected_depth(trained):
     folder, handle = trained / "eval" / "paper", load_run(trained, device="cpu")
-    assert (folder / "depth_pictures" / "scale.png").is_file()
+    assert (folder / "depth_pictures" / "scale.png").is_file() and (folder / "errors" / "test_scale.png").is_file()
     record = handle.results["paper"].sets["test"]
     low = []
     for name in handle.frame_names():
@@ -247,6 +254,15 @@ def test_what_train_and_phantom_cannot_make(capsys, scene, tmp_path):
     for words in options:
         refused(capsys, "phantom", "-o", tmp_path / "p", *words.split())
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+@pytest.mark.parametrize(
+    ("layout", "commands"), [("colmap", depth_commands(Path("colon"))), ("c3vd", [train_command(Path("colon"))])]
+)
+def test_a_phantom_without_depth_leads_to_it(monkeypatch, capsys, layout, commands):
+    monkeypatch.setattr("coliags_plugin.api.scenes.make_phantom", lambda output, **options: output)
+    assert run("phantom", "-o", "colon", "--layout", layout) == 0
+    assert capsys.readouterr().out.splitlines() == ["written: colon", *(f"next:    {each}" for each in commands)]
 
 
 # Processes

@@ -412,7 +412,7 @@ def test_a_phantom_to_be_made_has_a_cell_without_a_key(tmp_path, layout):
     ("options", "message"),
     [
         ({"methods": []}, "no method"),
-        ({"methods": ["colias"]}, "no method 'colias'.*Did you mean 'coliags'"),
+        ({"methods": ["colias"]}, "no method or ablation 'colias'.*Did you mean 'coliags'"),
         ({"methods": ["coliags", "coliags"]}, "more than one method is named coliags"),
         ({"seeds": 0}, "`seeds=0`"),
         ({"steps": 0}, "`steps=0`"),
