@@ -12,10 +12,26 @@ import yaml
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from coliags_plugin.config.method_config import descriptions, load_method, method_files, method_folder
-from coliags_plugin.config.yaml_tree import assignments, parse_assignments, parse_tree, parse_value
+from coliags_plugin.config.method_config import (
+    descriptions,
+    load_method,
+    method_files,
+    method_folder,
+    method_name,
+    method_text,
+)
+from coliags_plugin.config.yaml_tree import (
+    assignments,
+    dump,
+    dump_inline,
+    parse_assignments,
+    parse_tree,
+    parse_value,
+    plain_value,
+)
 from coliags_plugin.core import registry
 from coliags_plugin.core.errors import InputError
+from tests.commands import refuses
 
 
 @pytest.fixture
@@ -127,6 +143,43 @@ def test_files_and_overrides_change_what_they_inherit(method_file, text, overrid
     config = load_method(method_file("base: parent.yaml\n"), overrides).config
     assert {path: looked_up(config, path) for path in expected} == expected
     assert hasattr(looked_up(config, f"{HEAD}.settings"), "frequencies") == ("plain" not in text)
+
+
+@pytest.mark.parametrize(
+    "mapping",
+    [
+        {"base": "coliags", "field": {"voxel_size": np.float32(2.0)}, "losses": {"depth": None}},
+        {"description": "d", "base": Path("mine.yaml"), "strategy": {"name": "none"}, "schedule": {"steps": 7}},
+        {"base": "~/mine.yaml", "losses": {"edges": {"name": "d-ssim", "weight": 1e-5}}},
+        load_method("3dgs").config.model_dump(),
+    ],
+)
+def test_a_mapping_is_a_method_like_the_same_file(method_file, mapping, monkeypatch, tmp_path):
+    method_file("base: scaffold-gs\nfield: {voxel_size: 3.0}\n")
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.chdir(tmp_path)
+    text = method_text({"name": "my method", **mapping})
+    monkeypatch.chdir(tmp_path.parent)  # as a worker, which may be elsewhere
+    loaded = load_method(text)
+    plain = parse_value(dump_inline(plain_value(mapping, "")))
+    assert loaded.config == load_method(method_file(dump(plain), "same.yaml")).config
+    assert (loaded.name, method_name(method_text(mapping))) == ("my method", "mapping")
+    assert method_text(Path("a.yaml")) == method_text("a.yaml") == "a.yaml"
+
+
+@pytest.mark.parametrize(
+    ("mapping", "message"),
+    [
+        ({"base": "coliags", "feild": {}}, "mapping: feild: unknown key 'feild'.*Did you mean 'field'"),
+        ({"base": "coliags", "field": {"voxel_sise": 1}}, "mapping: field.voxel_sise: .*Did you mean 'voxel_size'"),
+        ({"base": "coliag"}, "no method 'coliag'.*Did you mean 'coliags'"),
+        ({"field": "anchors"}, "mapping: losses: is missing"),
+        ({"base": "coliags", "losses": {"mine": object()}}, "setting mapping.losses.mine is a object"),
+        (["coliags"], r"method \['coliags'\]. Expected a name, the path of a YAML file, or a mapping"),
+    ],
+)
+def test_mistakes_in_a_mapping_are_named(mapping, message):
+    refuses(message, lambda: load_method(method_text(mapping)))
 
 
 def test_origins_name_file_and_line_or_the_option():
