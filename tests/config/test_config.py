@@ -165,15 +165,15 @@ def test_comments_tell_file_and_line_or_the_option_and_the_meaning():
     "mapping",
     [
         {"base": "coliags", "field": {"voxel_size": np.float32(2.0)}, "losses": {"depth": None}},
-        {"description": "d", "base": Path("here/mine.yaml"), "strategy": {"name": "none"}, "schedule": {"steps": 7}},
-        {"base": "~/here/mine.yaml", "losses": {"edges": {"name": "d-ssim", "weight": 1e-5}}},
+        {"description": "d", "base": Path("mine.yaml"), "strategy": {"name": "none"}, "schedule": {"steps": 7}},
+        {"base": "~/mine.yaml", "losses": {"edges": {"name": "d-ssim", "weight": 1e-5}}},
         load_method("3dgs").config.model_dump(),
     ],
 )
 def test_a_mapping_is_a_method_like_the_same_file(method_file, mapping, monkeypatch, tmp_path):
-    method_file("base: scaffold-gs\nfield: {voxel_size: 3.0}\n")
-    monkeypatch.setenv("HOME", str(tmp_path))
-    monkeypatch.chdir(tmp_path)
+    folder = Path(method_file("base: scaffold-gs\nfield: {voxel_size: 3.0}\n")).parent
+    monkeypatch.setenv("HOME", str(folder))
+    monkeypatch.chdir(folder)
     text = method_text({"name": "my method", **mapping})
     monkeypatch.chdir(tmp_path.parent)  # as a worker, which may be elsewhere
     loaded = load_method(text)
