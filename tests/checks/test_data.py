@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -16,12 +17,14 @@ from coliags_plugin.checks.data.check import check_scene, video_pairs
 from coliags_plugin.checks.data.findings import findings_of, image_facts, lamp_facts, path_facts
 from coliags_plugin.checks.data.hypotheses import CHANGES, FrameMatches, Pair, agreement, best_scale, supported
 from coliags_plugin.checks.data.page import check_page
+from coliags_plugin.cli.texts import depth_commands
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.core.scenes import Frame, PointCloud, Scene, SparseDepth
 from coliags_plugin.datamanagers.c3vd import C3VDDataManager, C3VDSettings
 from coliags_plugin.engine.data_formats import open_scene
 from coliags_plugin.geometry.lenses.models import PinholeLens
+from coliags_plugin.reconstruction.depth.scene import training_options
 from coliags_plugin.reporting.colormaps import HATCH_GREYS
 from coliags_plugin.reporting.text_formats import page_text
 from tests.commands import run
@@ -348,6 +351,13 @@ def test_where_features_fail_points_are_followed(unmatched):
     assert check.matches["given"].error < 1.0
     assert check.matches["given"].count > 500
     assert "Points followed through" in page_text(check_page(check))
+
+
+def test_a_scene_without_dense_depth_is_to_be_given_it(unmatched, monkeypatch, capsys):
+    monkeypatch.setattr("coliags_plugin.engine.data_formats.open_scene", lambda *arguments, **options: unmatched)
+    assert run("check", "data", "SCENE", "--set", "split=block") == 0
+    expected = depth_commands(Path("SCENE"), ["--set", "split=block"], training_options(unmatched))
+    assert capsys.readouterr().out.splitlines()[-2:] == [f"next:    {command}" for command in expected]
 
 
 @pytest.mark.thorough

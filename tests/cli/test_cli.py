@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import math
+import re
 import shutil
 import signal
 import subprocess
@@ -16,6 +17,7 @@ import numpy as np
 import pytest
 
 from coliags_plugin import Run, load_run, report, train
+from coliags_plugin.cli.texts import depth_commands, train_command
 from coliags_plugin.comparison.scenes import find_scenes
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import read_rgb
@@ -176,10 +178,29 @@ def test_list_and_config_and_the_installation_and_a_dry_run_of_an_ablation(scene
     assert "scaffold-gs-depth" in capsys.readouterr().out
     assert run("list") == 0
     assert "renderers:" in capsys.readouterr().out
-    assert run("config", "coliags", "--origin") == 0
-    assert "frequencies: 10  # coliags.yaml:" in capsys.readouterr().out
+    assert run("config", "coliags") == 0
+    assert re.search(r"frequencies: 10  # coliags.yaml:\d+: Frequencies of gamma", capsys.readouterr().out)
     assert run("check", "installation") == 0
     assert "would use cpu" in capsys.readouterr().out
+
+
+def test_a_kind_and_a_component_are_described(capsys):
+    assert run("list", "losses") == 0
+    assert re.search(r"^l1 +Mean absolute difference over valid pixels", capsys.readouterr().out, re.MULTILINE)
+    assert run("list", "appearance_heads", "imia") == 0
+    printed = capsys.readouterr().out
+    assert printed.startswith("imia (built in): Improved appearance Modelling")
+    assert (
+        "\nbias_init    one of scene_distances, pytorch  scene_distances  Initial biases of hidden units.\n" in printed
+    )
+    assert printed.endswith("\ncolor_mlp        {lr: 0.008, final_lr: 5.0e-05}\n")
+    assert run("list", "losses", "depth-huber", "--json") == 0
+    described = json.loads(capsys.readouterr().out)
+    weight, delta = described["options"][0], described["options"][-1]
+    assert (weight["name"], weight["type"], "default" in weight) == ("weight", "number", False)
+    assert (delta["name"], delta["type"], delta["default"]) == ("delta", "number, > 0", 0.2)
+    assert "no loss 'depth-hubr'" in refused(capsys, "list", "losses", "depth-hubr")
+    assert "no kind of components 'methods'" in refused(capsys, "list", "methods", "coliags")
 
 
 # Bad input
@@ -233,6 +254,15 @@ def test_what_train_and_phantom_cannot_make(capsys, scene, tmp_path):
     for words in options:
         refused(capsys, "phantom", "-o", tmp_path / "p", *words.split())
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+@pytest.mark.parametrize(
+    ("layout", "commands"), [("colmap", depth_commands(Path("colon"))), ("c3vd", [train_command(Path("colon"))])]
+)
+def test_a_phantom_without_depth_leads_to_it(monkeypatch, capsys, layout, commands):
+    monkeypatch.setattr("coliags_plugin.api.scenes.make_phantom", lambda output, **options: output)
+    assert run("phantom", "-o", "colon", "--layout", layout) == 0
+    assert capsys.readouterr().out.splitlines() == ["written: colon", *(f"next:    {each}" for each in commands)]
 
 
 # Processes

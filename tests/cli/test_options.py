@@ -15,9 +15,10 @@ import tyro
 
 import coliags_plugin as cp
 from coliags_plugin.cli import COMMANDS, checks, poses
-from coliags_plugin.cli.texts import in_flags, print_summary, translate_for
+from coliags_plugin.cli.texts import depth_commands, in_flags, print_summary, translate_for
 from coliags_plugin.config.options import TrainOptions, takes
 from coliags_plugin.core import __version__
+from coliags_plugin.core.scenes import TO_GET_DEPTH
 from tests.commands import run
 
 #: Functions of the Python API by the class of their options.
@@ -30,7 +31,7 @@ FUNCTIONS = {
 
 @pytest.mark.parametrize(("options", "function"), FUNCTIONS.items(), ids=lambda value: value.__name__)
 def test_a_command_and_a_function_have_the_same_options_and_the_help_tells_them(options, function):
-    assert any(issubclass(command, options) for command in COMMANDS.values())
+    assert any(issubclass(command, options) for command in commands().values())
     shown = signature(function).parameters
     for name in {field.name for field in fields(options)} - {"data", "data_format", "device", "overwrite"}:
         assert name in shown
@@ -76,6 +77,14 @@ def test_options_come_in_one_order(kind):
         assert set(names[: names.index("output")]) <= {"scenes", "data"} & set(required), "the subject comes first"
     tail = [name for name in names if name in TAIL and name not in required]
     assert tail == sorted(tail, key=TAIL.index)
+
+
+def test_commands_for_depth_are_those_of_the_messages():
+    assert re.findall("`(.+?)`", TO_GET_DEPTH) == depth_commands(Path("SCENE"))
+    assert in_flags(TO_GET_DEPTH) == TO_GET_DEPTH
+    estimate, train = depth_commands(Path("my scene"), ["--set", "frame_step=2"], ["datamanager.split=block"])
+    assert estimate == "coliags depth 'my scene' --output 'my scene-depth' --set frame_step=2"
+    assert train == "coliags train coliags-plus --data 'my scene-depth' --set datamanager.split=block"
 
 
 def test_a_summary_for_people_and_for_scripts(capsys):
