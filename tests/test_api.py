@@ -20,6 +20,7 @@ from coliags_plugin.config.yaml_tree import parse_assignments
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import read_rgb
 from coliags_plugin.engine.run_folder import RunFolder
+from coliags_plugin.reporting.colormaps import depth_error, depth_limits, depth_scale_text, error_limit
 from coliags_plugin.reporting.image_files import read_depth_tiff
 from tests.commands import run
 from tests.comparison.small import TINY, InlineExecutor
@@ -121,8 +122,10 @@ def test_a_held_out_frame_is_rendered_as_evaluated(trained, result):
 def test_a_view_shows_truth_and_rendering(trained):
     view = trained.render("0000_color", depth="depth_expected", outputs=["normals"])
     assert view.outputs["normals"].shape == (24, 32, 3)
-    captions = ["truth", "rendered", "true depth, 0 to 30 mm", "depth, 0 to 30 mm", "depth error, 0 to 2 mm"]
-    assert list(view.images()) == captions
+    scale = depth_scale_text(depth_limits([view.depth, view.true_depth]), "mm")
+    captions = ["truth", "rendered", f"true depth, {scale}", f"depth, {scale}"]
+    end = error_limit([depth_error(view.depth, view.true_depth)])
+    assert list(view.images()) == [*captions, f"depth error, 0 to {end:g} mm, by square roots"]
     assert view._repr_html_().count("data:image/png;base64,") == 5
     camera = replace(view.camera, width=16)
     free = trained.render(camera)

@@ -23,6 +23,7 @@ from coliags_plugin.cli.runs import TrainCommand
 from coliags_plugin.cli.scenes import PhantomCommand
 from coliags_plugin.cli.texts import depth_commands
 from coliags_plugin.config.method_config import MethodConfig, OptimizerSettings, ScheduleSettings, load_method
+from coliags_plugin.config.reference import meanings, type_text
 from coliags_plugin.core.registry import REGISTRIES
 from coliags_plugin.core.render_output import OUTPUTS
 from coliags_plugin.core.splits import held_out
@@ -329,7 +330,7 @@ def test_the_page_of_options_has_each_with_its_range_and_meaning(kind):
             rows = re.findall(rf"^\| `{option}` \| (.+) \| (.+) \| (.+) \|$", text, re.MULTILINE)
             assert rows, f"{name}: {option} is not there"
             assert any(
-                range_text.startswith(tool("options")["type_text"](field).replace("|", "\\|"))
+                range_text.startswith(type_text(field.annotation, field.metadata).replace("|", "\\|"))
                 for range_text, _, _ in rows
             )
             for limit in field.metadata:
@@ -344,8 +345,9 @@ def test_the_page_of_options_has_the_settings_of_commands_with_their_meaning():
     for name, settings in tool("options")["COMMANDS"].items():
         section = text.split(f"\n### {name}\n")[1].split("\n### ")[0]
         for option, field in settings.model_fields.items():
-            assert f"| `{option}` | {tool('options')['type_text'](field)} | " in section, f"{name}: {option}"
-            assert tool("options")["meanings"](settings)[option] in section
+            text = f"| `{option}` | {type_text(field.annotation, field.metadata)} | "
+            assert text in section, f"{name}: {option}"
+            assert tool("options")["as_markdown"](meanings(settings)[option]) in section
 
 
 @pytest.mark.parametrize("name", METHODS)

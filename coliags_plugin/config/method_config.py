@@ -191,11 +191,11 @@ def method_tree(method: str, overrides: Iterable[str] = ()) -> Node:
     return override_all(_resolve(_find(method, Path.cwd()), ()), overrides)
 
 
-def _find(method: str, folder: Path) -> Path:
+def _find(method: str, folder: Path, asking: str = "") -> Path:
     if is_path(method):
         path = (folder / user_path(method)).resolve()
         if not path.is_file():
-            known = [file.name for file in path.parent.glob("*.y*ml")] + [*method_files()]
+            known = [file.name for file in path.parent.glob("*.y*ml") if file.name != asking] + [*method_files()]
             hint = did_you_mean(path.name, known) or "See `coliags list methods`"
             raise InputError(f"no file {path}", "a method config, or the name of a method without suffix", hint)
         return path
@@ -220,7 +220,7 @@ def _resolve(path: Path, descendants: tuple[Path, ...]) -> Node:
     if not isinstance(base.value, str):
         raise InputError(f"{base.origin}: base is {base.plain()!r}", "the name or path of a method config")
     try:
-        parent = _resolve(_find(base.value, path.parent), (*descendants, path))
+        parent = _resolve(_find(base.value, path.parent, path.name), (*descendants, path))
     except InputError as error:
         raise InputError(f"{base.origin}: base: {error.seen}", error.expected, error.do) from error
     inherited = {key: node for key, node in parent.value.items() if key != "description"}

@@ -351,7 +351,7 @@ class ReportOptions(Options):
     columns: Names = ()
     reference: OptionalText = None
     protocol: str = "paper"
-    frames: int = 4
+    frames: int = 2
     title: OptionalText = None
     note: OptionalText = None
     scene: OptionalPath = None

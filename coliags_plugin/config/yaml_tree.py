@@ -114,7 +114,10 @@ def parse_value(text: str) -> object:
 def _convert(loader: _Loader, node: yaml.Node, source: str) -> Node:
     origin = f"{source}:{node.start_mark.line + 1}"
     if not isinstance(node, yaml.MappingNode):
-        return Node(tuples(loader.construct_object(node, deep=True)), origin)
+        try:
+            return Node(tuples(loader.construct_object(node, deep=True)), origin)
+        except ValueError as error:  # of a date or number
+            raise InputError(f"{origin}: {error}", "valid YAML") from error
     children: dict[str, Node] = {}
     for key_node, value_node in node.value:
         key = str(loader.construct_object(key_node))

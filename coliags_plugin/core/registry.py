@@ -86,7 +86,7 @@ class Registry:
         target = self.get(name)
         kind = target if isinstance(target, type) else type(target)
         origin = {"class": _path(kind), "source": PLUGIN_PATH_VARIABLE if name in self._files else self._sources[name]}
-        file = self._files.get(name) or getattr(sys.modules[kind.__module__], "__file__", None)
+        file = self._files.get(name) or getattr(sys.modules.get(kind.__module__), "__file__", None)
         if file is not None:
             origin |= {"file": Path(file).name, "sha256": hashlib.sha256(Path(file).read_bytes()).hexdigest()}
         return origin

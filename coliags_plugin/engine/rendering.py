@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 import torch
-from jaxtyping import UInt8
+from jaxtyping import Float, UInt8
 from pydantic import Field, field_validator
 from torch import Tensor
 
@@ -25,18 +26,18 @@ from coliags_plugin.engine.held_light import render_held
 from coliags_plugin.engine.progress import ProgressReport
 from coliags_plugin.engine.trained import TrainedRun
 from coliags_plugin.reporting.colormaps import (
-    DEPTH_ERROR_LIMIT_MM,
-    RGB_ERROR_LIMIT,
     color_bar,
     colorize_depth,
     colorize_error,
     depth_error,
     depth_limits,
+    error_limit,
     rgb_error,
 )
-from coliags_plugin.reporting.image_files import as_array, eight_bit, write_depth_tiff, write_png
+from coliags_plugin.reporting.image_files import eight_bit, write_depth_tiff, write_png
 from coliags_plugin.reporting.video import check_rate, write_video
 
+_View = TypeVar("_View", Frame, Camera, Frame | Camera)
 #: Outputs of a view unless others are asked for.
 _WANTS = ("rgb", "alpha", "depth_accumulated")
 
@@ -46,9 +47,10 @@ def render_run(trained: TrainedRun, options: RenderOptions) -> Path:
 
     A relit run has its light in ``lamp.yaml``, and no colour errors, there being no images in that light. Depth, of one
     of the kinds of docs/conventions.md 3, is hatched where alpha is below 0.5, and has no errors where the scene's own
-    is estimated; as float32 TIFF it has scene units and all pixels. Feature channels have one or three numbers, 1 is
-    white. The video, ``trajectory.mp4``, has every frame's view in video order, rgb beside depth. With a camera path
-    to go ``along``, there are no images of frames, and the video is ``path.mp4``. Returns the folder.
+    is estimated; as float32 TIFF it has scene units and all pixels. Errors of the frames have one scale, in a picture
+    beside their folder. Feature channels have one or three numbers, 1 is white. The video, ``trajectory.mp4``, has
+    every frame's view in video order, rgb beside depth. With a camera path to go ``along``, there are no images of
+    frames, and the video is ``path.mp4``. Returns the folder.
     """
     along = None if options.along is None else CameraPath.read(options.along)
     output = options.output or trained.run.path / ("path" if along else "relit" if trained.relit else "renders")
@@ -64,23 +66,26 @@ def render_run(trained: TrainedRun, options: RenderOptions) -> Path:
         path = list(along.cameras(trained.scene.train[0].camera, options.fps))
     video = options.video and (along is not None or frame_sets(trained.scene).keys() >= {*options.frames})
     limits = sampled_depth_limits(trained, chosen or path, depth)
+    ends = _error_ends(trained, chosen, depth)
     with (
         atomic_folder(output, options.overwrite) as folder,
         ProgressReport("render", len(chosen) + len(path) * video) as progress,
     ):
         for count, frame in enumerate(chosen, start=1):
             view = render_view(trained, frame, (*wants, *channels))
-            _write_frame(folder, frame, view, depth, limits, trained)
+            write_png(folder / "rgb" / f"{frame.name}.png", eight_bit(view.rgb))
+            write_png(folder / "depth" / f"{frame.name}.png", depth_picture(view, depth, limits))
+            for name, error in _errors(trained, frame, view, depth).items():
+                write_png(folder / name / f"{frame.name}.png", colorize_error(error, ends[name]))
             if options.depth_tiff:
                 write_depth_tiff(folder / "depth_tiff" / f"{frame.name}.tiff", view[depth])
             for channel in channels:
                 write_png(folder / channel / f"{frame.name}.png", eight_bit(_as_rgb(view[channel])))
             progress.update(count)
         write_png(folder / "depth_scale.png", color_bar(limits, unit, "depth"))
-        if (folder / "depth_error").exists():  # some frame has true depth
-            write_png(folder / "depth_error_scale.png", color_bar((0.0, error_limit_of(trained)), unit, "error"))
-        if chosen and not trained.relit:
-            write_png(folder / "rgb_error_scale.png", color_bar((0.0, RGB_ERROR_LIMIT), "of full scale", "error"))
+        for name, of in (("rgb_error", "of full scale"), ("depth_error", unit)):
+            if (folder / name).exists():  # some frame has such an error
+                write_png(folder / f"{name}_scale.png", color_bar((0.0, ends[name]), of, "error"))
         for light in (trained.lamp, trained.held):
             if light is not None:
                 atomic_write(folder / "lamp.yaml", dump(light.described))
@@ -92,14 +97,29 @@ def render_run(trained: TrainedRun, options: RenderOptions) -> Path:
 
 def sampled_depth_limits(trained: TrainedRun, views: Sequence[Frame | Camera], depth: str) -> tuple[float, float]:
     """One scale for a kind of depth of all views, from that of four of them."""
-    sample = views[:: max(1, len(views) // 4)][:4]
-    rendered = (render_view(trained, view, ("rgb", "alpha", depth)) for view in sample)
-    return depth_limits([as_array(output[depth]) for output in rendered], trained.scene.length_unit)
+    rendered = (render_view(trained, view, ("rgb", "alpha", depth)) for view in _sample(views))
+    return depth_limits(opaque_depth(output, depth) for output in rendered)
 
 
-def error_limit_of(trained: TrainedRun) -> float:
-    """Largest depth error of the colour scale, scene units: 2 mm at the size at which the run was trained."""
-    return DEPTH_ERROR_LIMIT_MM / trained.model.scale
+def _error_ends(trained: TrainedRun, frames: Sequence[Frame], depth: str) -> dict[str, float]:
+    """Ends of the scales of errors by the names of their pictures, from the errors of four frames."""
+    wants = ("rgb", "alpha", depth)
+    sample = [_errors(trained, frame, render_view(trained, frame, wants), depth) for frame in _sample(frames)]
+    return {name: error_limit(each[name] for each in sample if name in each) for name in ("rgb_error", "depth_error")}
+
+
+def _sample(views: Sequence[_View]) -> Sequence[_View]:
+    return views[:: max(1, len(views) // 4)][:4]
+
+
+def _errors(trained: TrainedRun, frame: Frame, output: RenderOutput, depth: str) -> dict[str, np.ndarray]:
+    """Absolute errors of a rendered frame by the names of their pictures; of depth, scene units."""
+    errors, valid = {}, frame.valid.cpu()
+    if not trained.relit:
+        errors["rgb_error"] = rgb_error(output.rgb.cpu(), frame.image, valid)
+    if (true := frame.true_depth) is not None:
+        errors["depth_error"] = depth_error(output[depth].cpu(), true, valid)
+    return errors
 
 
 def frame_sets(scene: Scene) -> dict[str, list[Frame]]:
@@ -136,26 +156,14 @@ def _as_rgb(channel: Tensor) -> Tensor:
     return channel.reshape(*channel.shape[:2], -1).expand(-1, -1, 3)
 
 
-def _write_frame(
-    folder: Path, frame: Frame, output: RenderOutput, depth_name: str, limits: tuple[float, float], trained: TrainedRun
-) -> None:
-    name = f"{frame.name}.png"
-    depth = output[depth_name]
-    write_png(folder / "rgb" / name, eight_bit(output.rgb))
-    write_png(folder / "depth" / name, depth_picture(output, depth_name, limits))
-    valid = frame.valid.cpu()
-    if not trained.relit:
-        error = rgb_error(output.rgb.cpu(), frame.image, valid)
-        write_png(folder / "rgb_error" / name, colorize_error(error, RGB_ERROR_LIMIT))
-    if (true := frame.true_depth) is not None:
-        error = depth_error(depth.cpu(), true, valid)
-        write_png(folder / "depth_error" / name, colorize_error(error, error_limit_of(trained)))
-
-
 def depth_picture(output: RenderOutput, depth: str, limits: tuple[float, float]) -> UInt8[np.ndarray, "H W 3"]:
     """A rendered depth in colours between two limits, hatched where alpha is below :data:`OPAQUE_ALPHA`."""
-    depths = torch.where(output.alpha >= OPAQUE_ALPHA, output[depth], torch.nan)
-    return colorize_depth(depths, limits, hatched=True)
+    return colorize_depth(opaque_depth(output, depth), limits, hatched=True)
+
+
+def opaque_depth(output: RenderOutput, depth: str) -> Float[Tensor, "H W"]:
+    """A rendered depth, NaN where alpha is below :data:`OPAQUE_ALPHA`. [H, W]"""
+    return torch.where(output.alpha >= OPAQUE_ALPHA, output[depth], torch.nan)
 
 
 def _film(

@@ -6,6 +6,7 @@ from typing import ClassVar, Literal
 
 import torch
 from jaxtyping import Float
+from pydantic import Field
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -36,7 +37,7 @@ _FEWEST = 16
 class AttenuatedAppearanceSettings(Settings):
     """Options of the attenuation; the initial exponents are those of an inverse-square law at gamma 2.2."""
 
-    head: AppearanceHeadNode  # decoder of the colours that are attenuated
+    head: AppearanceHeadNode = Field(default="imia", validate_default=True)  # decoder of the colours before attenuation
     distance_exponent: float = -0.9  # initial a
     cosine_exponent: float = 0.3  # initial b where it is not fitted
     incidence_exponent: float | None = None  # initial c where it is not fitted; null: incidence does not count

@@ -53,5 +53,5 @@ class ReconstructionSettings(Settings):
     # least a quarter, the largest model at least these.
     steps: int = Field(default=2000, ge=1)
     mesh: MeshSettings = MeshSettings()  # fusion of the rendered depth into a mesh
-    coverage: CoverageSettings = CoverageSettings()  # limits within which wall counts as seen
+    coverage: CoverageSettings = CoverageSettings()  # limits within which wall counts as seen well
     seed: int = Field(default=0, ge=0)  # seed of training

@@ -1,6 +1,7 @@
 """Colour-mapped images of depth and errors, colour bars and rows of images. Arrays in, 8-bit RGB out.
 
-Depth is drawn with viridis and errors with inferno, both perceptually uniform and easy to tell apart.
+Depth is drawn with viridis and errors with inferno, both perceptually uniform and easy to tell apart. A scale of errors
+is for one set of frames, which it is stated beside.
 """
 
 from __future__ import annotations
@@ -15,17 +16,16 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from coliags_plugin.reporting.image_files import as_array
-from coliags_plugin.reporting.numbers import linear_ticks, tick_label
+from coliags_plugin.reporting.numbers import linear_ticks, log_ticks, tick_label
 
 if TYPE_CHECKING:
     from torch import Tensor
 
 ColorMap = Literal["depth", "error"]
 
-#: Full scale of stand-alone depth error maps, mm; the same for all, so that they are comparable.
-DEPTH_ERROR_LIMIT_MM = 2.0
-#: Full scale of RGB error maps, as a fraction of that of the colours.
-RGB_ERROR_LIMIT = 0.2
+#: Percentiles of depth between which its colours run, median errors that a scale of errors spans, and pixels of a map
+#: that enter either.
+_DEPTH_PERCENTILES, _MEDIAN_ERRORS, _SAMPLED = (1.0, 99.0), 8.0, 20_000
 #: Grey level of pixels of unknown depth.
 UNKNOWN_GREY = 128
 #: Grey levels of the hatching over error pixels without ground truth.
@@ -55,40 +55,66 @@ def colored(share: Float[np.ndarray, "*S"], color_map: ColorMap) -> UInt8[np.nda
 
 
 def colorize_depth(
-    depth_mm: Float[np.ndarray, "H W"] | Tensor, limits: tuple[float, float], hatched: bool = False
+    depth: Float[np.ndarray, "H W"] | Tensor, limits: tuple[float, float], hatched: bool = False
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """Colour-mapped depth of any kind, mm: near is dark, far is bright, what is not finite is grey, or hatched.
+    """Colour-mapped depth of any kind, on a logarithmic scale: near is dark, far bright, not finite grey, or hatched.
 
-    The limits are the depths of the first and the last colour, mm; values beyond them are clipped.
+    The limits are the depths of the first and the last colour, above 0 and in the unit of the depth; values beyond them
+    are clipped.
     """
-    depth = as_array(depth_mm).astype(np.float64)
-    low, high = limits
+    depth = as_array(depth).astype(np.float64)
     finite = np.isfinite(depth)
-    image = colored((np.where(finite, depth, low) - low) / (high - low), "depth")
+    image = colored(scale_places(np.where(finite, depth, limits[0]), limits, "depth"), "depth")
     image[~finite] = hatch(*finite.shape)[~finite] if hatched else UNKNOWN_GREY
     return image
 
 
-def common_limits(depths: Iterable[Float[np.ndarray, "H W"]]) -> tuple[float, float]:
-    """Range from 0 to the largest 99th percentile of depths in any unit, rounded up to two significant digits.
+def depth_limits(depths: Iterable[Float[np.ndarray, "H W"] | Tensor]) -> tuple[float, float]:
+    """Depths of the first and the last colour of the depth maps of one scene, in their unit: the low one is above 0.
 
-    For rendered depths, some of which may be far off; what is not finite is unknown.
+    They are the 1st and the 99th percentile of what is finite and above 0, rounded outwards to two significant digits,
+    so that neither the end of a lumen nor a speck before the lens takes the colours from the wall.
     """
-    finite = [depth[np.isfinite(depth)] for depth in depths]
-    largest = max((float(np.percentile(values, 99.0)) for values in finite if values.size), default=0.0)
-    if largest <= 0.0:
-        return 0.0, 1.0
-    step = 10.0 ** (math.floor(math.log10(largest)) - 1)
-    return 0.0, math.ceil(largest / step) * step
+    samples = [values.ravel()[:: math.ceil(values.size / _SAMPLED) or 1] for values in map(as_array, depths)]
+    pooled = np.concatenate([*samples, np.zeros(0)]).astype(np.float64)
+    pooled = pooled[np.isfinite(pooled) & (pooled > 0.0)]
+    if not pooled.size:
+        return 1.0, 10.0
+    low, high = np.percentile(pooled, _DEPTH_PERCENTILES).tolist()
+    low_step, high_step = (10.0 ** (math.floor(math.log10(end)) - 1) for end in (low, high))
+    low = math.floor(low / low_step) * low_step
+    return low, max(math.ceil(high / high_step) * high_step, low + low_step)
 
 
-def depth_limits(depths: Iterable[Float[np.ndarray, "H W"] | Tensor], unit: str = "mm") -> tuple[float, float]:
-    """Range from 0 to the largest finite depth, rounded up to 10 mm; :func:`common_limits` in another unit than mm."""
-    if unit != "mm":
-        return common_limits(map(as_array, depths))
-    finite = [array[np.isfinite(array)] for array in map(as_array, depths)]
-    largest = max((float(values.max()) for values in finite if values.size), default=0.0)
-    return 0.0, max(10.0, 10.0 * math.ceil(largest / 10.0))
+def depth_scale_text(limits: tuple[float, float], unit: str) -> str:
+    """The scale of depth in words: ``12 to 85 mm, logarithmic``."""
+    return f"{tick_label(limits[0])} to {tick_label(limits[1])} {unit}, logarithmic"
+
+
+def scale_places(
+    values: Float[np.ndarray, "*S"], limits: tuple[float, float], color_map: ColorMap
+) -> Float[np.ndarray, "*S"]:
+    """Places of values on a scale, 0 to 1, clipped to the limits: logarithmic for depth, for errors a square root.
+
+    So that the errors of a good and of a bad method can both be seen.
+    """
+    low, high = limits
+    values = np.clip(values, low, high)
+    if color_map == "depth":
+        return np.asarray(np.log(values / low) / math.log(high / low))
+    return np.asarray(np.sqrt((values - low) / (high - low)))
+
+
+def scale_ticks(limits: tuple[float, float], color_map: ColorMap) -> list[tuple[float, float]]:
+    """Ticks of a scale and their places from 0 to 1: the limits, and round numbers at some distance from them."""
+    low, high = limits
+    if color_map == "error":
+        inner = [share * high for share in (0.05, 0.2, 0.5)]
+    else:
+        inner = log_ticks(low, high) if high > 10.0 * low else linear_ticks(low, high)
+    places = scale_places(np.array(inner, np.float64), limits, color_map).tolist()
+    ticks = [(tick, place) for tick, place in zip(inner, places, strict=True) if 0.1 <= place <= 0.9]
+    return [(low, 0.0), *ticks, (high, 1.0)]
 
 
 def depth_error(
@@ -124,10 +150,25 @@ def rgb_error(
     return error if valid is None else np.where(as_array(valid).astype(bool), error, np.nan)
 
 
+def error_limit(errors: Iterable[Float[np.ndarray, "H W"]]) -> float:
+    """End of the scale of the error maps of a set, in their unit: eight times their median, rounded up to two digits.
+
+    Errors of zero and those that are not finite do not count.
+    """
+    samples = [error.ravel()[:: math.ceil(error.size / _SAMPLED) or 1] for error in errors]
+    pooled = np.concatenate([*samples, np.zeros(0)])
+    pooled = pooled[np.isfinite(pooled) & (pooled > 0.0)]
+    if not pooled.size:
+        return 1.0
+    end = _MEDIAN_ERRORS * float(np.median(pooled))
+    step = 10.0 ** (math.floor(math.log10(end)) - 1)
+    return math.ceil(end / step) * step
+
+
 def colorize_error(error: Float[np.ndarray, "H W"], limit: float) -> UInt8[np.ndarray, "H W 3"]:
     """Colour-mapped error of 0 to ``limit`` and more; where it is NaN, without ground truth, hatched in grey."""
     unknown = np.isnan(error)
-    image = colored(np.where(unknown, 0.0, error) / limit, "error")
+    image = colored(scale_places(np.where(unknown, 0.0, error), (0.0, limit), "error"), "error")
     image[unknown] = hatch(*error.shape)[unknown]
     return image
 
@@ -136,15 +177,13 @@ def color_bar(
     limits: tuple[float, float], unit: str, color_map: ColorMap = "error", width: int = 480
 ) -> UInt8[np.ndarray, "H W 3"]:
     """Horizontal colour bar with ticks and unit (ASCII, as OpenCV's font has no other characters), on white."""
-    (low, high), size = limits, 18
-    left, right, top = 24, width - text_width(unit) - 32, 8
+    left, right, top, size = 24, width - text_width(unit) - 32, 8, 18
     image = np.full((top + size + 26, width, 3), 255, np.uint8)
     image[top : top + size, left:right] = colored(np.linspace(0.0, 1.0, right - left)[None], color_map)
-    for tick in linear_ticks(low, high):
-        x = left + round((tick - low) / (high - low) * (right - left - 1))
+    for tick, place in scale_ticks(limits, color_map):
+        x = left + round(place * (right - left - 1))
         cv2.line(image, (x, top + size), (x, top + size + 4), INK, 1)
-        label = tick_label(tick)
-        draw_text(image, label, (x - text_width(label) // 2, top + size + 20))
+        draw_text(image, tick_label(tick), (x, top + size + 20), align=0.5)
     draw_text(image, unit, (right + 20, top + size - 4))
     return image
 

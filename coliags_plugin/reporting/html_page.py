@@ -21,7 +21,7 @@ from markupsafe import Markup, escape
 from coliags_plugin.core import __version__
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_write
-from coliags_plugin.reporting.colormaps import ColorMap, color_table
+from coliags_plugin.reporting.colormaps import ColorMap, color_table, scale_ticks
 from coliags_plugin.reporting.image_files import EncodedImage
 from coliags_plugin.reporting.model import Block, Figure, Page, Series
 from coliags_plugin.reporting.numbers import (
@@ -147,7 +147,7 @@ def environment(assets: Path) -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    functions = (color_stops, columns_of, enumerate, linear_ticks, sentence, style_classes, tick_label, unit_text)
+    functions = (color_stops, columns_of, enumerate, scale_ticks, sentence, style_classes, tick_label, unit_text)
     templates.filters["prose"] = prose
     templates.globals |= {"dash": DASH, "axes_of": Axes, **{function.__name__: function for function in functions}}
     return templates
@@ -199,7 +199,13 @@ class Axes:
     top: ClassVar[int] = 12
     bottom: ClassVar[int] = 250
 
-    def __init__(self, series: Sequence[Series], log_y: bool = False, names: Sequence[str] | None = None) -> None:
+    def __init__(
+        self,
+        series: Sequence[Series],
+        log_y: bool = False,
+        names: Sequence[str] | None = None,
+        equal_scales: bool = False,
+    ) -> None:
         self._log_y, self._names = log_y, names
         xs, ys = zip(*(point for line in series for point in line.points(log_y) if point), strict=True)
         self._x_limits = (min(xs), max(xs)) if names is None else (-0.5, len(names) - 0.5)
@@ -213,6 +219,12 @@ class Axes:
         else:
             margin = 0.06 * (high - low) or max(abs(high), 1.0) * 0.05
             self._y_limits = low - margin, high + margin
+        if equal_scales:
+            sides = [(self._x_limits, self.right - self.left), (self._y_limits, self.bottom - self.top)]
+            unit = max((high - low) / length for (low, high), length in sides)
+            self._x_limits, self._y_limits = (
+                ((low + high - unit * length) / 2, (low + high + unit * length) / 2) for (low, high), length in sides
+            )
 
     def x(self, value: float) -> float:
         """Horizontal coordinate of a value."""

@@ -25,6 +25,7 @@ from coliags_plugin.datamanagers.c3vd import C3VDDataManager, C3VDSettings
 from coliags_plugin.engine.data_formats import open_scene
 from coliags_plugin.geometry.lenses.models import PinholeLens
 from coliags_plugin.reconstruction.depth.scene import training_options
+from coliags_plugin.reporting.colormaps import HATCH_GREYS
 from coliags_plugin.reporting.text_formats import page_text
 from tests.commands import run
 from tests.datamanagers.wall_scenes import HEIGHT, WIDTH, write_wall
@@ -408,6 +409,19 @@ def test_another_calibration_of_endogslams_data_is_not_suspected(tmp_path):
     assert "EndoGSLAM's calibration" not in whats(scene)
 
 
+def test_frames_are_shown_reprojected_where_there_is_depth(scene):
+    sections = {section.title: section.blocks for section in check_page(check_scene(scene)).sections}
+    for group in sections["Reprojected frames"]:
+        files = [np.frombuffer(figure.image.data, np.uint8) for figure in group.figures]
+        frame, warped, difference = (cv2.imdecode(file, cv2.IMREAD_COLOR).astype(int) for file in files)
+        hatched = np.isin(difference, HATCH_GREYS).all(axis=2)
+        assert hatched.mean() < 0.5 and (warped[hatched] == difference[hatched]).all()
+        assert np.abs(frame - warped)[~hatched].mean() < 10.0 < np.abs(frame - warped)[hatched].mean()
+    assert [figure.equal_scales for figure in sections["Trajectory"][0].figures] == [False, True, True]
+    bare = check_page(check_scene(each(scene, lambda frame: frame.with_maps(depth=None)), match_images=False))
+    assert "Reprojected frames" in [section.title for section in bare.sections if not section.blocks]
+
+
 @pytest.mark.thorough
 def test_command_says_it_all(folder, scene, tmp_path, capsys):
     argv = ("check", "data", folder, "--html", tmp_path / "check.html")
@@ -421,7 +435,7 @@ def test_command_says_it_all(folder, scene, tmp_path, capsys):
     assert facts["suspect"] is False
     assert facts["data"]["frames"]["train"] == 21
     page = (tmp_path / "check.html").read_text()
-    assert page.count("<img ") == 18
+    assert page.count("<img ") == 9
     assert "z, mm" in page
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import math
+import re
 import shutil
 import signal
 import subprocess
@@ -23,7 +24,7 @@ from coliags_plugin.core.images import read_rgb
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.core.text_files import without_places
 from coliags_plugin.export.splats.formats import write_splats
-from coliags_plugin.reporting.colormaps import hatch
+from coliags_plugin.reporting.colormaps import colorize_error, depth_error, error_limit, hatch
 from coliags_plugin.reporting.image_files import read_depth_tiff
 from tests.commands import refused, run
 from tests.export.splats.clouds import random_cloud
@@ -94,6 +95,12 @@ def test_render_writes_images_scales_a_video_and_depth_as_numbers(trained, tmp_p
         picture = read_rgb(out / "depth" / f"{name}.png")
         low = view.alpha < 0.5
         assert (picture[low] == hatch(*low.shape)[low]).all()
+    views = [handle.render(name, depth=f"depth_{kind}") for name in handle.frame_names()]
+    errors = [depth_error(view.depth, view.true_depth) for view in views]
+    for view, error in zip(views, errors, strict=True):
+        drawn = colorize_error(error, error_limit(errors))
+        np.testing.assert_array_equal(read_rgb(out / "depth_error" / f"{view.name}.png"), drawn)
+        assert np.median(read_rgb(out / "rgb_error" / f"{view.name}.png")) > 20, "most errors are black"
     for folder in ("rgb", "depth", "rgb_error", "depth_error"):
         images = sorted((out / folder).iterdir())
         assert [path.stem for path in images] == [*handle.frame_names()]
@@ -112,7 +119,7 @@ def test_single_frames_are_rendered_without_a_video(trained, tmp_path):
 
 def test_eval_shows_the_expected_depth(trained):
     folder, handle = trained / "eval" / "paper", load_run(trained, device="cpu")
-    assert (folder / "depth_pictures" / "scale.png").is_file()
+    assert (folder / "depth_pictures" / "scale.png").is_file() and (folder / "errors" / "test_scale.png").is_file()
     record = handle.results["paper"].sets["test"]
     low = []
     for name in handle.frame_names():
@@ -171,10 +178,29 @@ def test_list_and_config_and_the_installation_and_a_dry_run_of_an_ablation(scene
     assert "scaffold-gs-depth" in capsys.readouterr().out
     assert run("list") == 0
     assert "renderers:" in capsys.readouterr().out
-    assert run("config", "coliags", "--origin") == 0
-    assert "frequencies: 10  # coliags.yaml:" in capsys.readouterr().out
+    assert run("config", "coliags") == 0
+    assert re.search(r"frequencies: 10  # coliags.yaml:\d+: Frequencies of gamma", capsys.readouterr().out)
     assert run("check", "installation") == 0
     assert "would use cpu" in capsys.readouterr().out
+
+
+def test_a_kind_and_a_component_are_described(capsys):
+    assert run("list", "losses") == 0
+    assert re.search(r"^l1 +Mean absolute difference over valid pixels", capsys.readouterr().out, re.MULTILINE)
+    assert run("list", "appearance_heads", "imia") == 0
+    printed = capsys.readouterr().out
+    assert printed.startswith("imia (built in): Improved appearance Modelling")
+    assert (
+        "\nbias_init    one of scene_distances, pytorch  scene_distances  Initial biases of hidden units.\n" in printed
+    )
+    assert printed.endswith("\ncolor_mlp        {lr: 0.008, final_lr: 5.0e-05}\n")
+    assert run("list", "losses", "depth-huber", "--json") == 0
+    described = json.loads(capsys.readouterr().out)
+    weight, delta = described["options"][0], described["options"][-1]
+    assert (weight["name"], weight["type"], "default" in weight) == ("weight", "number", False)
+    assert (delta["name"], delta["type"], delta["default"]) == ("delta", "number, > 0", 0.2)
+    assert "no loss 'depth-hubr'" in refused(capsys, "list", "losses", "depth-hubr")
+    assert "no kind of components 'methods'" in refused(capsys, "list", "methods", "coliags")
 
 
 # Bad input

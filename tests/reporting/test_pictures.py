@@ -1,5 +1,6 @@
 """Colour maps, image files and videos: arrays in, the same pixels out."""
 
+import math
 import struct
 
 import av
@@ -21,10 +22,12 @@ from coliags_plugin.reporting.colormaps import (
     color_table,
     colorize_depth,
     colorize_error,
-    common_limits,
     depth_error,
+    depth_limits,
+    depth_scale_text,
     hatch,
     rgb_error,
+    scale_ticks,
     side_by_side,
 )
 from coliags_plugin.reporting.image_files import EncodedImage, read_depth_tiff, write_depth_tiff, write_png
@@ -48,11 +51,11 @@ def test_depth_image():
     table = color_table("depth")
     image = colorize_depth(torch.tensor([[10.0, 60.0, 35.0, -5.0, 99.0]]), (10.0, 60.0))
     assert image.dtype == np.uint8
-    np.testing.assert_array_equal(image[0], table[[0, 255, 128, 0, 255]])
+    np.testing.assert_array_equal(image[0], table[[0, 255, round(255 * math.log(3.5) / math.log(6.0)), 0, 255]])
     unknown = np.full((9, 12), 30.0)
     unknown[:4] = np.nan
     unknown[3, :2] = np.inf, -np.inf
-    plain, hatched = (colorize_depth(unknown, (0.0, 60.0), hatched=each) for each in (False, True))
+    plain, hatched = (colorize_depth(unknown, (6.0, 60.0), hatched=each) for each in (False, True))
     assert (plain[4:] == hatched[4:]).all() and (plain[:4] == UNKNOWN_GREY).all()
     assert (hatched[:4] == hatch(9, 12)[:4]).all()
 
@@ -65,7 +68,7 @@ def test_depth_error_image():
     valid = np.ones((2, 4), bool)
     valid[1, 2] = False
     image = colorize_error(depth_error(torch.from_numpy(rendered), true, valid), limit=2.0)
-    np.testing.assert_array_equal(image[0], table[[0, 128, 255, 255]])
+    np.testing.assert_array_equal(image[0], table[[0, 180, 255, 255]])  # square roots: 0.71 of the scale at half of it
     np.testing.assert_array_equal(image[1, 0], table[255])  # nothing rendered where there is a truth
     np.testing.assert_array_equal(image[1, 1:3], hatch(2, 4)[1, 1:3])
     np.testing.assert_array_equal(image[1, 3], table[0])
@@ -79,7 +82,7 @@ def test_rgb_error_image():
     rendered = true.copy()
     rendered[0, 1] = (51, 0, 0)  # a mean of 17 levels: one third of 0.2
     rendered[0, 2] = 255
-    expected = table[[0, 85, 255]]
+    expected = table[[0, round(255 / math.sqrt(3)), 255]]
 
     def image(*arguments):
         return colorize_error(rgb_error(*arguments), limit=0.2)[0]
@@ -117,14 +120,28 @@ def test_side_by_side():
 
 
 @pytest.mark.parametrize("unit", [1.0, 0.01, 1000.0])
-def test_common_limits_follow_the_unit_and_leave_out_what_is_far_off(unit):
-    depth = np.linspace(0.0, 4.0, 1001).reshape(7, 143)
+def test_depth_limits_follow_the_unit_and_leave_out_what_is_far_off(unit):
+    depth = np.linspace(10.0, 50.0, 1001).reshape(7, 143)
     far = depth.copy()
-    far[0, :3] = 1e6
-    far[1, 0] = np.nan
-    assert common_limits([unit * depth, unit * far]) == (0.0, pytest.approx(unit * 4.0))
-    assert common_limits([np.full((2, 2), unit * 4.12)]) == (0.0, pytest.approx(unit * 4.2))
-    assert common_limits([np.full((2, 2), np.nan)]) == (0.0, 1.0)
+    far[0, :3], far[3, :3] = 1e6, 1e-6
+    far[1, :4] = np.nan, np.inf, 0.0, -7.0
+    # Percentiles of 10.4 and 49.6; two digits, outwards.
+    expected = (pytest.approx(unit * 10.0), pytest.approx(unit * 50.0))
+    assert depth_limits([unit * depth, torch.from_numpy(unit * far)]) == expected
+    low, high = depth_limits([np.full((2, 2), unit * 4.15)])
+    assert (low, high) == (pytest.approx(unit * 4.1), pytest.approx(unit * 4.2))
+    low, high = depth_limits([np.full((2, 2), unit * 4.0)])
+    assert low <= unit * 4.0 * (1 + 1e-9) and low < high <= unit * 4.2
+    assert depth_limits([np.full((2, 2), np.nan)]) == (1.0, 10.0)
+
+
+def test_a_scale_of_depth_is_logarithmic_and_names_its_limits():
+    assert scale_ticks((10.0, 1000.0), "depth") == [(value, pytest.approx(math.log10(value) / 2 - 0.5)) for value in
+                                                    (10.0, 20.0, 50.0, 100.0, 200.0, 500.0, 1000.0)]  # fmt: skip
+    assert [tick for tick, _ in scale_ticks((12.0, 85.0), "depth")] == [12.0, 20.0, 40.0, 60.0, 85.0]
+    assert scale_ticks((0.0, 2.0), "error") == [(pytest.approx(tick), pytest.approx(math.sqrt(tick / 2.0))) for tick in
+                                                (0.0, 0.1, 0.4, 1.0, 2.0)]  # fmt: skip
+    assert depth_scale_text((12.0, 85.0), "mm") == "12 to 85 mm, logarithmic"
 
 
 # Image files

@@ -68,7 +68,7 @@ class SeenWall:
     views: FaceViews  # how the frames saw each triangle; guessed ones are unseen
     level: UInt8[np.ndarray, "F"]  # the values of :class:`Level`
     names: list[str]  # of the frames
-    settings: CoverageSettings  # what counts as seen
+    settings: CoverageSettings  # what counts as seen well
     metric: bool  # whether lengths are mm; else their unit is unknown
 
     @property

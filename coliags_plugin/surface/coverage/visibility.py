@@ -27,7 +27,7 @@ from coliags_plugin.geometry.meshes.mesh import TriangleMesh
 
 
 class CoverageSettings(Settings):
-    """Options of what counts as seen, and of which missed regions are listed. Lengths are mm."""
+    """Options of what counts as seen well, and of which missed regions are listed. Lengths are mm."""
 
     max_distance: float = Field(default=100.0, gt=0.0)  # farthest z-depth at which surface counts as seen, mm
     far: float = Field(default=60.0, gt=0.0)  # surface that no frame shows from nearer is seen too far away, mm
@@ -303,13 +303,13 @@ class Level(IntEnum):
     UNSEEN = 0
     POOR = 1
     GLANCE = 2
-    SEEN = 3
+    SEEN_WELL = 3
 
 
-#: Labels and colours (RGB; told apart with any colour vision) of maps and meshes: by level, what was seen first, and of
-#: what was neither seen nor reconstructed, where the place of the surface is a guess.
+#: Labels and colours (RGB; told apart with any colour vision) of maps and meshes: by level, what was seen well first, and
+#: of what was neither seen nor reconstructed, where the place of the surface is a guess.
 MAP_LEGEND = (
-    ("seen", (150, 200, 190)),
+    ("seen well", (150, 200, 190)),
     ("seen only at a glance", (240, 200, 66)),
     ("seen too dark or too far", (95, 75, 139)),
     ("not seen", (213, 62, 0)),
@@ -320,11 +320,11 @@ MAP_LEGEND = (
 def classify(views: FaceViews, settings: CoverageSettings) -> UInt8[np.ndarray, "F"]:
     """Level of each triangle, the values of :class:`Level`. [F]
 
-    Seen: ``glance_frames`` frames or more saw it near and bright enough, at an angle to its normal of at most
+    Seen well: ``glance_frames`` frames or more saw it near and bright enough, at an angle to its normal of at most
     ``grazing``. At a glance: fewer did, but some saw it near and bright enough. Too dark or too far: no frame did.
     """
     level = np.full(len(views.frames), int(Level.UNSEEN), np.uint8)
     level[views.frames > 0] = Level.POOR
     level[views.clear_frames > 0] = Level.GLANCE
-    level[views.good_frames >= settings.glance_frames] = Level.SEEN
+    level[views.good_frames >= settings.glance_frames] = Level.SEEN_WELL
     return level

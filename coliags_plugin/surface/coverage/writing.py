@@ -137,7 +137,7 @@ def face_colors(coverage: SeenWall) -> UInt8[np.ndarray, "F 3"]:
 
 def _legend_index(coverage: SeenWall) -> Int[np.ndarray, "F"]:
     """Entry of each triangle in the legend. [F]"""
-    return np.where(coverage.guessed, len(Level), Level.SEEN - coverage.level.astype(int))
+    return np.where(coverage.guessed, len(Level), Level.SEEN_WELL - coverage.level.astype(int))
 
 
 def legend_areas(coverage: SeenWall) -> dict[str, float]:
@@ -178,9 +178,10 @@ def coverage_page(
     settings = coverage.settings
     near = f" from at most {settings.far:g} mm" if np.isfinite(settings.far) else ""
     method = (
-        f"Seen: {settings.glance_frames} frames or more show the surface{near}, in pixels of a grey value of "
-        f"{settings.dark:g} or more (of 1), at most {settings.grazing:g} degrees from its normal. At a glance: fewer "
-        "frames do. Too dark or too far: frames show it, but none so near and bright."
+        "Seen: one frame or more shows the surface. Seen well: "
+        f"{settings.glance_frames} frames or more show it{near}, in pixels of a grey value of {settings.dark:g} or more "
+        f"(of 1), at most {settings.grazing:g} degrees from its normal. At a glance: fewer frames do. Too dark or too "
+        "far: frames show it, but none so near and bright."
     )
     if isinstance(coverage, PartialCoverage):
         note = (
@@ -219,13 +220,16 @@ def clock_text(degrees: float) -> str:
 def coverage_facts(coverage: WallCoverage | PartialCoverage) -> list[Fact]:
     """Seen wall, section and missed regions, for the page and the terminal."""
     total, seen_area = coverage.area(), coverage.area(coverage.level != Level.UNSEEN)
+    well_area = coverage.area(coverage.level == Level.SEEN_WELL)
     frames = Fact("frames", str(len(coverage.names)))
     if isinstance(coverage, PartialCoverage):
-        seen = Fact("seen", area_text(seen_area, coverage.metric))
+        texts = (area_text(area, coverage.metric) for area in (seen_area, well_area))
+        seen = Fact("seen", "{}, {} of it well".format(*texts))
         return [seen, Fact("section", "none", note=coverage.reason), frames]
     missed = sum(region.area for region in coverage.regions)
     return [
         Fact("seen", f"{100.0 * seen_area / total:.0f} % of the wall"),
+        Fact("seen well", f"{100.0 * well_area / total:.0f} % of the wall"),
         Fact("section", f"{coverage.section.length:.0f} mm of the lumen, {total / 100.0:.0f} cm²"),
         Fact("missed regions", f"{len(coverage.regions)}, {missed / 100.0:.1f} cm² together"),
         Fact("place guessed", f"{100.0 * coverage.area(coverage.guessed) / total:.0f} % of the wall"),
@@ -300,7 +304,7 @@ def region_picture(
     corners = corners.reshape(-1, 3)
     painted = image.copy()
     for triangle in np.rint(pixels[corners[drawable[corners].all(axis=1)]]).astype(np.int32):
-        cv2.fillConvexPoly(painted, triangle, MAP_LEGEND[Level.SEEN - Level.UNSEEN][1])
+        cv2.fillConvexPoly(painted, triangle, MAP_LEGEND[Level.SEEN_WELL - Level.UNSEEN][1])
     return np.asarray(cv2.addWeighted(painted, _OPACITY, image, 1.0 - _OPACITY, 0.0))
 
 

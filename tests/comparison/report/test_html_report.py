@@ -6,6 +6,7 @@ import base64
 import csv
 import io
 import json
+import math
 import re
 import shutil
 from html.parser import HTMLParser
@@ -15,11 +16,11 @@ import numpy as np
 import pytest
 
 from coliags_plugin.comparison.report.report import write_report
-from coliags_plugin.comparison.report.views import error_limit, evenly
+from coliags_plugin.comparison.report.views import evenly
 from coliags_plugin.config.options import ReportOptions
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.reporting.colormaps import color_table, hatch
-from coliags_plugin.reporting.image_files import EncodedImage, write_depth_tiff
+from coliags_plugin.reporting.colormaps import color_table, depth_limits, error_limit, hatch
+from coliags_plugin.reporting.image_files import EncodedImage, read_depth_tiff, write_depth_tiff
 from tests.commands import refused, run
 from tests.comparison.report.made import (
     FRAMES,
@@ -108,7 +109,8 @@ def test_one_file_that_needs_nothing_else(tmp_path, two_runs):
     html = (tmp_path / "out" / "report.html").read_text()
     assert html == (tmp_path / "again.html").read_text(), "the same runs give the same bytes"
     assert "@import" not in html and "import(" not in html and "fetch(" not in html
-    assert re.findall(r"url\((.*?)\)", html) == ["#depth-error-scale", "#depth-scale"]
+    scales = [f"#depth-{kind}-{index}" for index in range(len(FRAMES)) for kind in ("error-scale", "scale")]
+    assert re.findall(r"url\((.*?)\)", html) == scales
     assert "prefers-color-scheme: dark" in html
     style = html.split("<style>")[1].split("</style>")[0]
     used = {word for _, attributes in page.tags for word in (attributes.get("class") or "").split()}
@@ -139,8 +141,8 @@ def test_views_are_spread_over_each_set_and_the_worst_are_among_them(tmp_path):
         ("0100", "1 of 2", "worst PSNR and Depth MSE of coliags"),
         ("0110", "2 of 2", ""),
     ]
-    # truth, its depth, a rendering and its error; two of the slider; and the sample of the hatch
-    assert len(page.all("img")) == 6 * 4 + 2 + 1
+    # truth, its depth, a rendering and its error; two of the slider; and the sample of the hatch for each set
+    assert len(page.all("img")) == 6 * 4 + 2 + len(FRAMES)
 
 
 @pytest.mark.parametrize(
@@ -150,18 +152,20 @@ def test_evenly(length, count, indices):
     assert evenly(length, count) == indices
 
 
-def test_error_maps_share_one_scale(tmp_path, two_runs):
-    # The errors are 0.5 mm in one run and 1 mm in the other, so the scale ends at 1 mm.
-    page = report(tmp_path, two_runs)
-    table = color_table("error")
-    (first, *_), (second, *_) = (page.images(f"depth error of {name}") for name in ("coliags", "3dgs"))
-    assert first.shape == (HEIGHT, WIDTH, 3)
-    assert np.abs(first[5].astype(int) - table[128]).max() <= 2
-    assert (second[5] == table[255]).all()
-    assert not (first[0] == first[5]).all(), "pixels without truth look like pixels with one"
-    assert "|depth error| [mm] 0 0.2 0.4 0.6 0.8 1" in page.words
-    assert "depth [mm]" in page.words
-    assert "95 %" in page.words
+def test_error_maps_of_a_set_share_one_scale(tmp_path, two_runs):
+    """Errors are 0.5 mm in one run and 1 mm in the other, and ten times that off the path: the median is 0.75 mm."""
+    for run in two_runs:
+        for file in (run / "eval/paper/depth/rotation").iterdir():
+            true = read_depth_tiff(run / "eval/paper/true_depth/rotation" / file.name)
+            write_depth_tiff(file, true + 10.0 * (read_depth_tiff(file) - true))
+    page, table = report(tmp_path, two_runs), color_table("error")
+    for name, error in (("coliags", 0.5), ("3dgs", 1.0)):
+        color = table[round(math.sqrt(error / 6.0) * 255)]
+        images = page.images(f"depth error of {name}")
+        assert len(images) == 4 and all(image.shape == (HEIGHT, WIDTH, 3) for image in images)
+        assert all(np.abs(image[5].astype(int) - color).max() <= 4 for image in images)
+        assert not any((image[0] == image[5]).all() for image in images), "pixels without truth look like known ones"
+    assert "|depth error| [mm] 0 0.3 1.2 3 6" in page.words and "|depth error| [mm] 0 3 12 30 60" in page.words
 
 
 @pytest.mark.parametrize("with_truth", [True, False])
@@ -176,27 +180,29 @@ def test_expected_depth_is_shown_and_hatched(tmp_path, with_truth):
             write_depth_tiff(run / "eval" / "paper" / "expected_depth" / name / f"{frame}.tiff", depth)
     page = report(tmp_path, [run])
     shown = page.images("expected depth of coliags")
-    assert len(shown) == 6
-    # The scale goes from 0 to the true depths' 60 mm, or without any to 40 mm.
-    color = color_table("depth")[round(40 / 60 * 255 if with_truth else 255)]
+    assert len(shown) == 4
+    # The scale is that of the true depths, or without any of the expected ones, which are all alike.
+    true = np.linspace(20, 60, HEIGHT * WIDTH).reshape(HEIGHT, WIDTH)[1:]
+    low, high = depth_limits([true]) if with_truth else (40.0, 41.0)
+    color = color_table("depth")[round(math.log(40.0 / low) / math.log(high / low) * 255)]
     assert all(np.abs(image[5].astype(int) - color).max() <= 2 for image in shown)
     assert all((image[0] == hatch(HEIGHT, WIDTH)[0]).all() for image in shown)
     assert "no true depth" not in page.text  # as it is where true depth of other methods is compared
-    assert "depth [mm]" in page.words
+    assert re.search(rf" depth \[mm\] {low:g} [0-9. ]*{high:g} ", page.words)
 
 
 @pytest.mark.parametrize(
     ("errors", "limit"),
     [
-        ([np.array([0.0, 1.3]), np.array([1.3, np.inf])], 2.0),
-        ([np.linspace(0, 1, 101)], 1.0),
-        ([np.linspace(0, 1, 1_000_001)], 1.0),  # sampled
+        ([np.array([0.0, 1.3]), np.array([1.3, np.inf])], 11.0),  # 10.4, upwards
+        ([np.linspace(0, 1, 101), np.array([np.nan])], 4.1),
+        ([np.linspace(0, 1, 1_000_001)], 4.1),  # sampled
         ([], 1.0),
-        ([np.zeros(3)], 1e-6),
+        ([np.zeros(3)], 1.0),
     ],
 )
 def test_error_limit(errors, limit):
-    assert error_limit(errors) == limit
+    assert error_limit(errors) == pytest.approx(limit)
 
 
 def test_without_depth_colors_are_compared_and_large_images_reduced(tmp_path, two_runs):
@@ -204,7 +210,7 @@ def test_without_depth_colors_are_compared_and_large_images_reduced(tmp_path, tw
     page = report(tmp_path, [write_run(tmp_path / "run", result, depth=None)])
     assert page.images("true image")[0].shape == (33, 427, 3) and "1/3 of their size" in page.words
     assert "|colour error| [levels of 255]" in page.words
-    assert len(page.images("colour error of coliags")) == 6
+    assert len(page.images("colour error of coliags")) == 4
     assert "depth [mm]" not in page.words
     assert "Error against distance" not in page.words
     (two_runs[1] / "eval" / "paper" / "depth" / "test" / "0004.tiff").unlink()

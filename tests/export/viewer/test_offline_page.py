@@ -292,5 +292,5 @@ def test_meshes_of_the_run_are_layers_and_maps_of_coverage_have_a_legend_of_thei
         shutil.rmtree(run.path / folder)
     assert re.findall(r'value="\d"[^>]*>([\w ]+)</label>', page.html)[:2] == ["Gaussians", "surface"]
     assert '"about":"1 triangle","legend":[]' in page.html
-    assert '"legend":[["seen",[150,200,190]],["not seen",[213,62,0]]]' in page.html
+    assert '"legend":[["seen well",[150,200,190]],["not seen",[213,62,0]]]' in page.html
     assert "Gaussians; " in page.text and "recorded light" not in page.text, "the method knows no lamp"

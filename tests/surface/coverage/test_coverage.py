@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import html
 import json
+import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -138,7 +139,7 @@ def test_levels_tell_a_glance_darkness_and_distance_apart():
     good, dark, far = view_at((0, 0, 0), grey=100), view_at((0, 0, 0), grey=20), view_at((0, 0, -20), grey=100)
     slanted = view_at((60, 0, 15), (-60, 0, 25), grey=100, lens=pinhole(focal=200.0))
     near_slant = CoverageSettings(glance_frames=1, far=100.0, dark=0.2, grazing=60.0)
-    assert level(good, good) == Level.SEEN
+    assert level(good, good) == Level.SEEN_WELL
     assert level(good) == Level.GLANCE and level(good, dark) == Level.GLANCE
     assert level(dark, dark) == Level.POOR and level(far, far) == Level.POOR
     assert level(view_at((0, 0, 0), (0, 0, -1))) == Level.UNSEEN
@@ -382,6 +383,13 @@ def test_the_command_writes_a_folder(phantom, tmp_path, capsys):
     page = (out / "coverage.html").read_text()
     assert RESEARCH_USE in page and "http" not in page.replace("http://www.w3.org", "")
     assert (out / "map.png").is_file() and read_mesh(out / "coverage.ply").colors is not None
+    # Wall that any frame shows is seen, and a smaller part of it seen well: two numbers under two names everywhere.
+    shares = values["shares"]
+    assert 0.0 < shares["seen_well"] < values["seen"] == pytest.approx(1.0 - shares["unseen"])
+    for name, share in (("seen", values["seen"]), ("seen well", shares["seen_well"])):
+        assert f"<dt>{name}</dt><dd>{100.0 * share:.0f} % of the wall</dd>" in page
+        assert re.search(rf"^{name} +{100.0 * share:.0f} % of the wall$", printed, re.MULTILINE)
+    assert f"seen well</th><td><span>{shares['seen_well'] * values['area'] / 100.0:.1f} cm²" in page
     assert "already exists" in refused(capsys, "coverage", phantom, "--mesh", wall, "--output", out)
 
 
