@@ -35,7 +35,7 @@ def test_what_is_stored_is_small_whole_and_of_no_machine_and_on_its_page(path):
 
 def test_each_notebook_is_on_the_site_and_on_the_page_of_the_api():
     names = [path.stem for path in (ROOT / "docs" / "notebooks").glob("*.ipynb")]
-    menu, page = ((ROOT / "docs" / name).read_text(encoding="utf-8") for name in ("tools/mkdocs.yml", "api.md"))
+    menu, page = ((ROOT / name).read_text(encoding="utf-8") for name in ("docs/tools/mkdocs.yml", "docs/api.md"))
     assert all(f"notebooks/{name}.md" in menu and f"notebooks/{name}.ipynb" in page for name in names)
 
 

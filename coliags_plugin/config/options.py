@@ -12,7 +12,6 @@ from typing import Annotated, Any, Literal, TypeVar, get_origin, get_type_hints
 
 import tyro
 
-from coliags_plugin.config.method_config import method_text
 from coliags_plugin.config.yaml_tree import assignments
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import user_path
@@ -90,7 +89,9 @@ class Options:
         for name, value in vars(self).items():
             if types[name] in (Path, Path | None) and isinstance(value, (str, Path)):
                 object.__setattr__(self, name, user_path(value))
-            elif name == "method" and value is not None:
+            elif name == "method" and not isinstance(value, (str, type(None))):
+                from coliags_plugin.config.method_config import method_text  # which needs NumPy
+
                 object.__setattr__(self, name, method_text(value))
             elif name == "settings" and not isinstance(value, tuple):
                 object.__setattr__(self, name, assignments(value))
