@@ -7,18 +7,29 @@ from coliags_plugin.core import __version__
 
 if TYPE_CHECKING:
     from coliags_plugin.api.comparing import compare, report, variant
-    from coliags_plugin.api.runs import Run, import_splats, load_run, train
-    from coliags_plugin.api.scenes import load_scene, make_phantom, reconstruct
+    from coliags_plugin.api.runs import Run, import_splats, load_run, open_training, train
+    from coliags_plugin.api.scenes import (
+        check_data,
+        estimate_depth,
+        estimate_poses,
+        load_scene,
+        make_phantom,
+        reconstruct,
+    )
     from coliags_plugin.core.registry import register
 
 __all__ = [
     "Run",
     "__version__",
+    "check_data",
     "compare",
+    "estimate_depth",
+    "estimate_poses",
     "import_splats",
     "load_run",
     "load_scene",
     "make_phantom",
+    "open_training",
     "reconstruct",
     "register",
     "report",
@@ -29,8 +40,8 @@ __all__ = [
 #: Names of the API by its modules.
 _MODULES = {
     "api.comparing": ("compare", "report", "variant"),
-    "api.runs": ("Run", "import_splats", "load_run", "train"),
-    "api.scenes": ("load_scene", "make_phantom", "reconstruct"),
+    "api.runs": ("Run", "import_splats", "load_run", "open_training", "train"),
+    "api.scenes": ("check_data", "estimate_depth", "estimate_poses", "load_scene", "make_phantom", "reconstruct"),
     "core.registry": ("register",),
 }
 

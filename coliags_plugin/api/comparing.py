@@ -6,28 +6,29 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from coliags_plugin.api.runs import Run
+from coliags_plugin.api.runs import Run, warn_of_suspect_data
+from coliags_plugin.config.method_config import Method, method_text
 from coliags_plugin.config.options import CompareOptions, ReportOptions, takes
 from coliags_plugin.config.yaml_tree import assignments
 from coliags_plugin.core.files import user_path
 
 if TYPE_CHECKING:
-    from coliags_plugin.comparison.compare import FinishedComparison
+    from coliags_plugin.comparison.compare import FinishedComparison, Methods
     from coliags_plugin.comparison.named_files import Variant
     from coliags_plugin.comparison.report.report import WrittenReport
     from coliags_plugin.reporting.model import Section
 
 
 @takes(CompareOptions)
-def compare(methods: str | Variant | Sequence[str | Variant], options: CompareOptions) -> FinishedComparison:
+def compare(methods: Methods, options: CompareOptions) -> FinishedComparison:
     """Train and evaluate methods on scenes: what is missing is run, what is done is kept.
 
     Images, poses and depth of a scene that contradict each other, as far as that is quickly seen, are warned of before
     the first run.
 
     Args:
-        methods: Names of methods or ablations, paths of method configs or files of variants, or variants
-            (:func:`variant`).
+        methods: Names of methods or ablations, paths of method configs or files of variants, mappings like a config, or
+            variants (:func:`variant`).
         options: See below.
 
     Raises:
@@ -35,18 +36,17 @@ def compare(methods: str | Variant | Sequence[str | Variant], options: CompareOp
             run.
         InterruptedRunError: Ctrl-C; all runs are saved, and the same call goes on with them.
     """
-    from coliags_plugin.api.runs import warn_of_suspect_data
     from coliags_plugin.comparison.compare import carry_out
 
     return carry_out(methods, options, warn_of_suspect_data)
 
 
-def variant(name: str, method: str, settings: Mapping[str, Any]) -> Variant:
+def variant(name: str, method: Method, settings: Mapping[str, Any]) -> Variant:
     """A method with changes, under a name of its own.
 
     Args:
         name: In tables and file names.
-        method: Name of a method or path of a method config.
+        method: Name of a method, or path or mapping of a method config.
         settings: Changes of the method config, see :func:`~coliags_plugin.api.runs.train`.
 
     Raises:
@@ -54,7 +54,7 @@ def variant(name: str, method: str, settings: Mapping[str, Any]) -> Variant:
     """
     from coliags_plugin.comparison.named_files import Variant
 
-    return Variant(name, method, assignments(settings))
+    return Variant(name, method_text(method), assignments(settings))
 
 
 @takes(ReportOptions)

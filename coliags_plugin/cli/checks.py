@@ -7,7 +7,6 @@ import shutil
 import sys
 import tempfile
 from dataclasses import asdict, dataclass
-from functools import partial
 from io import TextIOWrapper
 from pathlib import Path
 from typing import Annotated
@@ -74,44 +73,26 @@ class CheckMethodCommand:
 
 
 @dataclass(frozen=True)
-class CheckDataCommand:
+class CheckDataCommand(options.CheckDataOptions):
     """Describe a scene and check that images, poses, depth and calibration agree; exit status 1 if suspect."""
 
-    scene: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SCENE")]
-    """The scene's folder."""
-    html: options.OptionalPath = None
-    """Also write an HTML page with images and the trajectory."""
-    set: options.Assignments = ()
-    """An option of the data manager, for instance split=block."""
-    data_format: options.DataFormat = None
     json: options.AsJson = False
 
     def run(self) -> None:
         """Run the checks and print the results."""
-        from coliags_plugin.checks.data.check import check_scene
-        from coliags_plugin.checks.data.page import check_page, verdict
-        from coliags_plugin.engine.data_formats import open_scene
-        from coliags_plugin.engine.progress import progress_callback
+        from coliags_plugin.api.scenes import check_data
         from coliags_plugin.reconstruction.depth.scene import training_options
-        from coliags_plugin.reporting.html_page import write_html
-        from coliags_plugin.reporting.text_formats import page_text
 
-        with progress_callback() as progress:
-            scene = open_scene(self.scene, self.data_format, self.set, progress)
-            at_stored_size = partial(open_scene, self.scene, scene.provenance.dataset, self.set, stored_size=True)
-            check = check_scene(scene, progress, at_stored_size if scene.is_resized else None)
-        page = check_page(check)
-        if self.html is not None:
-            write_html(page, self.html)
-        chosen = [f"datamanager.{key.removeprefix('datamanager.')}" for key in self.set]
+        check = check_data(self)
+        chosen = [f"datamanager.{key.removeprefix('datamanager.')}" for key in self.settings]
         chosen += [] if self.data_format is None else [f"datamanager.name={self.data_format}"]
-        reading = [word for item in self.set for word in ("--set", item)]
+        reading = [word for item in self.settings for word in ("--set", item)]
         reading += [] if self.data_format is None else ["--data-format", self.data_format]
         then = [train_command(self.scene, chosen)]
         if check.facts["depth"] is None:
-            then = depth_commands(self.scene, reading, training_options(scene))
+            then = depth_commands(self.scene, reading, training_options(check.scene))
         print_summary(
-            f"{page_text(page)}\n\n{verdict(check)}",
+            str(check),
             check.as_json(),
             written=[] if self.html is None else [self.html],
             then=[] if check.findings else then,

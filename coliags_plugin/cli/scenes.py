@@ -69,61 +69,20 @@ class PhantomCommand:
         print_summary(facts={"settings": options}, written=[folder], then=then, as_json=self.json)
 
 
-_OptionalLength = Annotated[float | None, tyro.conf.arg(metavar="LENGTH", help_behavior_hint="")]
-
-
 @dataclass(frozen=True)
-class DepthCommand:
+class DepthCommand(options.DepthOptions):
     """Estimate the dense depth of a video with known poses, with its confidence; write it as a scene to train on."""
 
-    scene: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SCENE")]
-    """The scene's folder. Depth that it has is ignored."""
-    output: options.Output
-    """Folder to create, in nerfstudio's layout."""
-    prior: options.OptionalPath = None
-    """Folder of depth maps by image name (16-bit .png, .tiff, .npy or .exr), any unit, to fit instead of brightness."""
-    near: _OptionalLength = None
-    """Nearest depth, in the scene's unit of length, with --far; default: found from features."""
-    far: _OptionalLength = None
-    """Farthest depth."""
-    jobs: options.OptionalInt = None
-    """Number of threads; default: one for each core."""
-    set: options.Assignments = ()
-    """An option of the data manager, as width=675, or of estimation, as depth.agreement=0.01 (docs/depth.md)."""
-    data_format: options.DataFormat = None
-    overwrite: options.Overwrite = False
     json: options.AsJson = False
 
     def run(self) -> None:
         """Estimate, or resume; write the scene and print a summary."""
-        from coliags_plugin.config.yaml_tree import settings_of
-        from coliags_plugin.core.files import refuse_existing, refuse_overlap
-        from coliags_plugin.engine.data_formats import open_scene
-        from coliags_plugin.engine.progress import progress_callback
-        from coliags_plugin.reconstruction.depth.scene import estimate_scene, training_options
-        from coliags_plugin.reconstruction.depth.sweeping import DepthEstimationSettings
+        from coliags_plugin.api.scenes import estimate_depth
+        from coliags_plugin.config.yaml_tree import assignments
 
-        refuse_overlap(self.output, self.scene)
-        refuse_existing(self.output, self.overwrite)
-        if (self.near is None) != (self.far is None):
-            raise InputError("--near without --far, or the reverse", "both or neither")
-        if self.jobs is not None and self.jobs < 1:
-            raise InputError(f"--jobs {self.jobs}", "a number of threads of 1 or more")
-        depth_settings = [item.removeprefix("depth.") for item in self.set if item.startswith("depth.")]
-        settings = settings_of(DepthEstimationSettings, depth_settings, "depth.")
-        with progress_callback() as progress:
-            # Images are read when they are needed, so that memory does not grow with the video.
-            of_manager = [item for item in self.set if not item.startswith("depth.")]
-            reading = ["initial_points=none", "keep_pixels=false", *of_manager]
-            scene = open_scene(self.scene, self.data_format, reading, progress)
-            near_far = None if self.near is None or self.far is None else (self.near, self.far)
-            summary, warnings = estimate_scene(
-                scene, self.output, settings, near_far, self.prior, self.jobs, self.overwrite, progress
-            )
-        for warning in warnings:
-            log.warning(warning)
-        train = train_command(self.output, training_options(scene))
-        print_summary(summary, written=[self.output], then=[train], as_json=self.json)
+        scene = estimate_depth(self)
+        train = train_command(scene.folder, assignments(scene.settings))
+        print_summary(scene.summary, written=[scene.folder], then=[train], as_json=self.json)
 
 
 @dataclass(frozen=True)

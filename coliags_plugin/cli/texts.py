@@ -64,7 +64,7 @@ def print_summary(
     ``facts`` say the same as ``text`` in JSON values; ``then`` are commands to type next.
     """
     if as_json:
-        values = ({"summary": text} if text else {}) if facts is None else facts
+        values = ({"summary": in_flags(text)} if text else {}) if facts is None else facts
         summary = {**values, "written": [str(path) for path in written], "next": list(then)}
         print(json.dumps(summary, indent=2, allow_nan=False, default=str))
         return

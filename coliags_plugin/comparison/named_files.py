@@ -11,7 +11,7 @@ from typing import Annotated, Any, TypeVar
 from pydantic import AfterValidator, Field, field_validator, model_validator
 from typing_extensions import Self
 
-from coliags_plugin.config.method_config import BENCHMARKS, is_path, method_files, method_folder, method_name
+from coliags_plugin.config.method_config import BENCHMARKS, is_path, is_text, method_files, method_folder, method_name
 from coliags_plugin.config.yaml_tree import at_origins, dump_inline, read_tree
 from coliags_plugin.core import registry
 from coliags_plugin.core.errors import InputError, check_name, did_you_mean
@@ -151,15 +151,15 @@ class AblationSettings(Settings):
 
 
 def variants_of(name: str) -> list[Variant]:
-    """The variants of an ablation, or a method alone; both by name, or by the path of a YAML file.
+    """The variants of an ablation, or a method alone; both by name, or by the path of a YAML file, or as its text.
 
     Raises:
         InputError: There is no such file or name, a method has the name of an ablation, or variants are not valid.
     """
-    ablations, methods = shipped(ABLATIONS), method_files()
+    ablations, methods, is_ablation = shipped(ABLATIONS), method_files(), False
     if is_path(name):
         is_ablation = "variants" in read_tree(user_path(name)).value
-    else:
+    elif not is_text(name):
         check_name("method or ablation", name, sorted([*methods, *ablations]))
         is_ablation = name in ablations
         if is_ablation and name in methods:

@@ -21,7 +21,10 @@ from coliags_plugin.config.yaml_tree import (
     dump,
     dump_inline,
     merge,
+    nodes,
     override_all,
+    parse_value,
+    plain_value,
     read_tree,
 )
 from coliags_plugin.core import registry
@@ -160,8 +163,33 @@ class LoadedMethod:
         return "\n".join(_annotated(self.config, self.tree, "")) + "\n"
 
 
+#: Name of a method, path of its file, or a mapping like that.
+Method = str | Path | Mapping[str, Any]
+#: Origin of the values of a method that is a mapping, and its name where it has none.
+MAPPING = "mapping"
+
+
+def method_text(method: Method) -> str:
+    """A method as options hold it: its name, the path of its file, or of a mapping, YAML in one line.
+
+    A mapping may hold its ``name`` beside what a file holds; a relative path of its base is one here. InputError if it
+    is none of these, or the mapping holds something that YAML does not.
+    """
+    if isinstance(method, (str, Path)):
+        return str(method)
+    if not isinstance(method, Mapping):
+        raise InputError(f"method {method!r}", 'a name, the path of a YAML file, or a mapping, {"base": "coliags"}')
+    base = str(method.get("base"))
+    return dump_inline(plain_value({**method, "base": user_path(base).resolve()} if is_path(base) else method, MAPPING))
+
+
+def is_text(method: str) -> bool:
+    """True for what :func:`method_text` makes of a mapping, not a name or path."""
+    return method.startswith("{")
+
+
 def load_method(method: str, overrides: Iterable[str] = (), data_format: str | None = None) -> LoadedMethod:
-    """Resolve a method config by its name (``coliags``, ``ablations/imia``), or the path of a YAML file.
+    """Resolve a method config by its name (``coliags``, ``ablations/imia``), the path of a YAML file, or its text.
 
     ``key.path=value`` overrides are applied last. A data format is the name of a data manager that takes the place of
     the method's, with all its options.
@@ -183,20 +211,22 @@ def _with_data_format(tree: Node, data_format: str) -> Node:
 
 
 def method_name(method: str) -> str:
-    """Name of a method, or of its file without the suffix."""
+    """Name of a method, of its file without the suffix, or within its text."""
+    if is_text(method):
+        return str(nodes(parse_value(method), MAPPING).value.get("name", Node(MAPPING, "")).value)
     return Path(method).stem if is_path(method) else method
 
 
 def method_tree(method: str, overrides: Iterable[str] = ()) -> Node:
     """Merged config tree of a method with overrides applied, before validation, each value with its origin."""
-    return override_all(_resolve(_find(method, Path.cwd()), ()), overrides)
+    return override_all(_resolve(method, Path.cwd(), ()), overrides)
 
 
-def _find(method: str, folder: Path, asking: str = "") -> Path:
+def _find(method: str, folder: Path, descendants: tuple[Path, ...]) -> Path:
     if is_path(method):
         path = Path(os.path.abspath(folder / user_path(method)))
         if not path.is_file():
-            known = [file.name for file in path.parent.glob("*.y*ml") if file.name != asking] + [*method_files()]
+            known = [file.name for file in path.parent.glob("*.y*ml") if file not in descendants] + [*method_files()]
             hint = did_you_mean(path.name, known) or "See `coliags list methods`"
             raise InputError(f"no file {path}", "a method config, or the name of a method without suffix", hint)
         return path
@@ -210,18 +240,23 @@ def _find(method: str, folder: Path, asking: str = "") -> Path:
     return files[method]
 
 
-def _resolve(path: Path, descendants: tuple[Path, ...]) -> Node:
-    if path in descendants:
-        chain = " -> ".join(p.name for p in (*descendants, path))
-        raise InputError(f"method configs inherit from each other: {chain}", "a chain of bases that ends")
-    tree = read_tree(path)
+def _resolve(method: str, folder: Path, descendants: tuple[Path, ...]) -> Node:
+    if is_text(method):
+        tree = nodes(parse_value(method), MAPPING)
+        tree.value.pop("name", None)
+    else:
+        path = _find(method, folder, descendants)
+        if path in descendants:
+            chain = " -> ".join(p.name for p in (*descendants, path))
+            raise InputError(f"method configs inherit from each other: {chain}", "a chain of bases that ends")
+        tree, folder, descendants = read_tree(path), path.parent, (*descendants, path)
     base = tree.value.get("base")
     if base is None:
         return tree
     if not isinstance(base.value, str):
         raise InputError(f"{base.origin}: base is {base.plain()!r}", "the name or path of a method config")
     try:
-        parent = _resolve(_find(base.value, path.parent, path.name), (*descendants, path))
+        parent = _resolve(base.value, folder, descendants)
     except InputError as error:
         raise InputError(f"{base.origin}: base: {error.seen}", error.expected, error.do) from error
     inherited = {key: node for key, node in parent.value.items() if key != "description"}

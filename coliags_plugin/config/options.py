@@ -89,6 +89,10 @@ class Options:
         for name, value in vars(self).items():
             if types[name] in (Path, Path | None) and isinstance(value, (str, Path)):
                 object.__setattr__(self, name, user_path(value))
+            elif name == "method" and not isinstance(value, (str, type(None))):
+                from coliags_plugin.config.method_config import method_text  # which needs NumPy
+
+                object.__setattr__(self, name, method_text(value))
             elif name == "settings" and not isinstance(value, tuple):
                 object.__setattr__(self, name, assignments(value))
             elif get_origin(types[name]) is tuple and not isinstance(value, tuple):
@@ -100,7 +104,7 @@ class TrainOptions(Options):
     """Options of training a method on a scene.
 
     Args:
-        method: Name of a method (`coliags list methods`) or path of a YAML file.
+        method: Name of a method (`coliags list methods`) or path of a YAML file; in Python also a mapping like one.
         output: Run folder; default runs/SCENE/METHOD/STAMP.
         steps: Training steps; schedules are scaled to them. A resumed run keeps its own unless given.
         seed: Seed of all random generators; default 0, for a resumed run its own.
@@ -358,6 +362,80 @@ class ReportOptions(Options):
     formats: Annotated[
         tuple[Literal["html", "markdown", "latex", "csv", "json", "all", "text"], ...], tyro.conf.arg(name="format")
     ] = ("html",)
+    overwrite: Overwrite = False
+
+
+@dataclass(frozen=True)
+class CheckDataOptions(Options):
+    """Options of checking a scene.
+
+    Args:
+        scene: The scene's folder.
+        html: Also write an HTML page with images and the trajectory.
+        settings: An option of the data manager, for instance split=block.
+    """
+
+    scene: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SCENE")]
+    html: OptionalPath = None
+    settings: Assignments = ()
+    data_format: DataFormat = None
+
+
+@dataclass(frozen=True)
+class DepthOptions(Options):
+    """Options of estimating the depth of a scene.
+
+    Args:
+        scene: The scene's folder. Depth that it has is ignored.
+        output: Folder to create, in nerfstudio's layout.
+        prior: Folder of depth maps by image name (16-bit .png, .tiff, .npy, .exr), any unit, in place of brightness.
+        near: Nearest depth, in the scene's unit of length, with the farthest; default: found from features.
+        far: Farthest depth.
+        jobs: Number of threads; default: one for each core.
+        settings: Option of the data manager, as width=675, or of estimation, as depth.agreement=0.01 (docs/depth.md).
+    """
+
+    scene: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SCENE")]
+    output: Output
+    prior: OptionalPath = None
+    near: Annotated[float | None, _flag("LENGTH")] = None
+    far: Annotated[float | None, _flag("LENGTH")] = None
+    jobs: OptionalInt = None
+    settings: Assignments = ()
+    data_format: DataFormat = None
+    overwrite: Overwrite = False
+
+
+@dataclass(frozen=True)
+class PosesOptions(Options):
+    """Options of estimating the poses of a video.
+
+    Args:
+        frames: Video, folder of one with its calibration, or folder of images ordered by the numbers in their names.
+        output: Folder to create, in COLMAP's layout.
+        camera: A known camera, scaled to the images (c3vd: whole frames of C3VD; c3vd-undistorted; NAME.xml: of a
+            calibration file), or a camera model of COLMAP, for instance PINHOLE or OPENCV_FISHEYE; default: of the
+            calibration file in the folder, else the better of SIMPLE_RADIAL_FISHEYE and SIMPLE_RADIAL.
+        params: Parameters of COLMAP's model, pixel centres at integers + 0.5, kept fixed; default: estimated.
+        diameter: The colon's typical inner diameter, which fixes the scale roughly; default: the scale stays unknown.
+        distance: Names of two images and the known distance between their cameras, which fixes the scale.
+        mask: Mask image, black where pixels are ignored, or a folder with one per image; default: black surroundings
+            and overlays are found, of images of one size.
+        every: Use every n-th image.
+        max_frames: Use at most the first n images.
+        settings: An option of matching or mapping, for instance exhaustive_up_to=80 or features.max_features=2000.
+    """
+
+    frames: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FRAMES")]
+    output: Output
+    camera: OptionalText = None
+    params: Annotated[OptionalText, tyro.conf.arg(metavar="P1,P2,...")] = None
+    diameter: OptionalFloat = None
+    distance: Annotated[tuple[str, str, float] | None, _flag("IMAGE IMAGE MM")] = None
+    mask: OptionalPath = None
+    every: int = 1
+    max_frames: OptionalInt = None
+    settings: Assignments = ()
     overwrite: Overwrite = False
 
 

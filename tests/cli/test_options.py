@@ -31,7 +31,7 @@ FUNCTIONS = {
 
 @pytest.mark.parametrize(("options", "function"), FUNCTIONS.items(), ids=lambda value: value.__name__)
 def test_a_command_and_a_function_have_the_same_options_and_the_help_tells_them(options, function):
-    assert any(issubclass(command, options) for command in COMMANDS.values())
+    assert any(issubclass(command, options) for command in commands().values())
     shown = signature(function).parameters
     for name in {field.name for field in fields(options)} - {"data", "data_format", "device", "overwrite"}:
         assert name in shown

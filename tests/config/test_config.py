@@ -12,10 +12,26 @@ import yaml
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from coliags_plugin.config.method_config import descriptions, load_method, method_files, method_folder
-from coliags_plugin.config.yaml_tree import assignments, parse_assignments, parse_tree, parse_value
+from coliags_plugin.config.method_config import (
+    descriptions,
+    load_method,
+    method_files,
+    method_folder,
+    method_name,
+    method_text,
+)
+from coliags_plugin.config.yaml_tree import (
+    assignments,
+    dump,
+    dump_inline,
+    parse_assignments,
+    parse_tree,
+    parse_value,
+    plain_value,
+)
 from coliags_plugin.core import registry
 from coliags_plugin.core.errors import InputError
+from tests.commands import refuses
 
 
 @pytest.fixture
@@ -143,6 +159,43 @@ def test_comments_tell_file_and_line_or_the_option_and_the_meaning():
     assert "max_gain: 8.0  # default: Gains are at least 1 / max_gain and at most max_gain." in lines
     assert "schedule:  # How long to train and how often to write." in lines
     assert yaml.safe_load(loaded.annotated()) == yaml.safe_load(loaded.config.to_yaml())
+
+
+@pytest.mark.parametrize(
+    "mapping",
+    [
+        {"base": "coliags", "field": {"voxel_size": np.float32(2.0)}, "losses": {"depth": None}},
+        {"description": "d", "base": Path("mine.yaml"), "strategy": {"name": "none"}, "schedule": {"steps": 7}},
+        {"base": "~/mine.yaml", "losses": {"edges": {"name": "d-ssim", "weight": 1e-5}}},
+        load_method("3dgs").config.model_dump(),
+    ],
+)
+def test_a_mapping_is_a_method_like_the_same_file(method_file, mapping, monkeypatch, tmp_path):
+    folder = Path(method_file("base: scaffold-gs\nfield: {voxel_size: 3.0}\n")).parent
+    monkeypatch.setenv("HOME", str(folder))
+    monkeypatch.chdir(folder)
+    text = method_text({"name": "my method", **mapping})
+    monkeypatch.chdir(tmp_path.parent)  # as a worker, which may be elsewhere
+    loaded = load_method(text)
+    plain = parse_value(dump_inline(plain_value(mapping, "")))
+    assert loaded.config == load_method(method_file(dump(plain), "same.yaml")).config
+    assert (loaded.name, method_name(method_text(mapping))) == ("my method", "mapping")
+    assert method_text(Path("a.yaml")) == method_text("a.yaml") == "a.yaml"
+
+
+@pytest.mark.parametrize(
+    ("mapping", "message"),
+    [
+        ({"base": "coliags", "feild": {}}, "mapping: feild: unknown key 'feild'.*Did you mean 'field'"),
+        ({"base": "coliags", "field": {"voxel_sise": 1}}, "mapping: field.voxel_sise: .*Did you mean 'voxel_size'"),
+        ({"base": "coliag"}, "no method 'coliag'.*Did you mean 'coliags'"),
+        ({"field": "anchors"}, "mapping: losses: is missing"),
+        ({"base": "coliags", "losses": {"mine": object()}}, "setting mapping.losses.mine is a object"),
+        (["coliags"], r"method \['coliags'\]. Expected a name, the path of a YAML file, or a mapping"),
+    ],
+)
+def test_mistakes_in_a_mapping_are_named(mapping, message):
+    refuses(message, lambda: load_method(method_text(mapping)))
 
 
 @pytest.mark.parametrize(

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import io
 import json
+import logging
 import sys
 from unittest import mock
 
 import pytest
 from rich.console import Console
 
-from coliags_plugin.contracts import Follower
+from coliags_plugin.contracts import Follower, StopTraining
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.json_files import scalars
 from coliags_plugin.engine import progress as module
@@ -144,7 +145,19 @@ def test_followers_change_nothing_and_end_nothing(tmp_path, caplog):
     followed.train(followers=[follower])
     assert without_clock(log_rows(followed)) == without_clock(log_rows(alone))
     assert [call.args for call in follower.stepped.call_args_list] == [(1,), (2,)] and not follower.close.called
-    assert "training goes on without Mock: no space" in caplog.text
+    assert "training goes on without Mock: RuntimeError('no space')" in caplog.text
+
+
+def test_a_follower_ends_training_after_a_step_that_is_saved(tmp_path, caplog):
+    caplog.set_level(logging.INFO)
+    trainer, stopping, other = make_trainer(tmp_path / "run"), mock.Mock(spec=Follower), mock.Mock(spec=Follower)
+    stopping.stepped.side_effect = [None, StopTraining("enough")]
+    trainer.start()
+    trainer.train(followers=[stopping, other])
+    assert trainer.step == trainer.run.step == 2 < trainer.steps
+    assert other.stepped.call_args_list == [mock.call(1), mock.call(2)]
+    assert stopping.close.called and other.close.called
+    assert "Mock ends training: enough" in caplog.text
 
 
 def test_a_missing_library_is_told_before_anything_is_written(tmp_path, capsys, monkeypatch):

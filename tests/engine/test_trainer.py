@@ -113,6 +113,19 @@ def without_clock(rows):
     return [{key: value for key, value in row.items() if key != "seconds"} for row in rows]
 
 
+def test_a_loop_of_halves_of_steps_is_training_to_the_bit(tmp_path):
+    overrides = ["modules.exposure={name: gain}", "optimizers={exposure.gain: {lr: 0.01}}"]
+    usual, trainer = train(tmp_path / "a", overrides=overrides), make_trainer(tmp_path / "b", overrides=overrides)
+    trainer.start()
+    while trainer.step < trainer.steps:
+        step = trainer.render_step()
+        terms = {key: loss(step) for key, loss in trainer.losses.items()}
+        weights = {key: trainer.losses[key].settings.weight_at(step.step, trainer.steps) for key in terms}
+        trainer.finish_step(step, torch.stack([weights[key] * term for key, term in terms.items()]).sum())
+    trainer.save()
+    assert_same(final_state(trainer), final_state(usual))
+
+
 @pytest.mark.parametrize(
     ("method", "steps", "cut", "overrides", "number"),
     [

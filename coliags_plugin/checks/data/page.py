@@ -17,9 +17,17 @@ from coliags_plugin.reporting import model
 from coliags_plugin.reporting.colormaps import colorize_error, hatch, rgb_error
 from coliags_plugin.reporting.image_files import EncodedImage, eight_bit
 from coliags_plugin.reporting.numbers import counted, sentence, short_number
+from coliags_plugin.reporting.text_formats import page_text
 
 #: Number of pairs shown, and difference of the last colour, as a fraction of full scale.
 _SHOWN, _DIFFERENCE = 3, 0.2
+
+
+class ShownCheck(SceneCheck):
+    """A result that ``print`` and notebooks show as text."""
+
+    def __repr__(self) -> str:
+        return f"{page_text(check_page(self))}\n\n{verdict(self)}"
 
 
 def check_page(check: SceneCheck) -> model.Page:

@@ -154,9 +154,9 @@ def test_evenly(length, count, indices):
 
 def test_error_maps_of_a_set_share_one_scale(tmp_path, two_runs):
     """Errors are 0.5 mm in one run and 1 mm in the other, and ten times that off the path: the median is 0.75 mm."""
-    for run in two_runs:
-        for file in (run / "eval/paper/depth/rotation").iterdir():
-            true = read_depth_tiff(run / "eval/paper/true_depth/rotation" / file.name)
+    for folder in two_runs:
+        for file in (folder / "eval/paper/depth/rotation").iterdir():
+            true = read_depth_tiff(folder / "eval/paper/true_depth/rotation" / file.name)
             write_depth_tiff(file, true + 10.0 * (read_depth_tiff(file) - true))
     page, table = report(tmp_path, two_runs), color_table("error")
     for name, error in (("coliags", 0.5), ("3dgs", 1.0)):

@@ -236,7 +236,7 @@ def test_another_brightness_than_the_videos_is_warned_of(caplog, recorded, light
 
 
 def test_several_formats_are_of_one_baking(anchors, tmp_path, few_steps):
-    exported = anchors.export(tmp_path / "wall.any", "ply", "spz", measure=False)
+    exported = anchors.export(tmp_path / "wall.any", formats=["ply", "spz"], measure=False)
     assert [part.file.name for part in exported] == ["wall.ply", "wall.spz"]
     first, second = (read_splats(part.file) for part in exported)
     assert len(first) == len(second) and "dB" not in exported[0].text
@@ -401,7 +401,7 @@ def test_exports_that_cannot_be(run_of, anchors, tmp_path, capsys, few_steps):
     assert "already exists" in refused(capsys, "export", trained.path, "--output", tmp_path / "there.ply")
     assert (tmp_path / "there.ply").read_text() == "mine"
     with pytest.raises(InputError, match="no format 'sog'"):
-        trained.export(tmp_path / "a.sog", "sog")
+        trained.export(tmp_path / "a.sog", formats="sog")
     with pytest.raises(InputError, match="no light 'men'"):
         anchors.export(tmp_path / "a.ply", light="men")
     with pytest.raises(InputError, match="relit"):

@@ -14,6 +14,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+import coliags_plugin as cp
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import write_image, write_mask
 from coliags_plugin.core.scene_files import write_unit
@@ -24,6 +25,7 @@ from coliags_plugin.reconstruction.depth import estimate
 from coliags_plugin.reconstruction.depth.estimate import Estimation, WorkFolder, check_video
 from tests import commands
 from tests.commands import run
+from tests.faults import content
 from tests.reconstruction.depth.walls import NORMAL, OFFSET, sideways, wall_depth, wall_frames
 from tests.scenes import write_frames
 
@@ -42,6 +44,14 @@ def estimated(wall, tmp_path_factory):
     out = tmp_path_factory.mktemp("estimates") / "out"
     assert run("depth", wall, "--output", out, *OPTIONS) == 0
     return out
+
+
+def test_the_function_writes_what_the_command_does(wall, estimated, tmp_path):
+    settings = {"depth.features.highlight_level": 256}
+    estimate = cp.estimate_depth(wall, tmp_path / "out", jobs=1, settings=settings)
+    assert content(tmp_path / "out") == content(estimated)
+    assert estimate.summary.startswith(f"{COUNT} frames, ") and estimate.settings == {}
+    assert len(cp.load_scene(estimate.folder).train) == 7
 
 
 def refused(capsys, *argv):
