@@ -345,8 +345,8 @@ def test_the_page_of_options_has_the_settings_of_commands_with_their_meaning():
     for name, settings in tool("options")["COMMANDS"].items():
         section = text.split(f"\n### {name}\n")[1].split("\n### ")[0]
         for option, field in settings.model_fields.items():
-            text = f"| `{option}` | {type_text(field.annotation, field.metadata)} | "
-            assert text in section, f"{name}: {option}"
+            row = f"| `{option}` | {type_text(field.annotation, field.metadata)} | "
+            assert row in section, f"{name}: {option}"
             assert tool("options")["as_markdown"](meanings(settings)[option]) in section
 
 

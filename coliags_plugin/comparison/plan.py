@@ -164,11 +164,11 @@ def make_cells(
             config = _config(scene, variant.method, overrides)
             for kind, name in config.components():
                 if registry.REGISTRIES[kind].source(name) == registry.REGISTERED:
-                    seen = f"method '{variant.name}' uses '{name}' of {kind}, which this process registered"
-                    do = (
-                        f"Define COMPONENTS in a file and set {registry.PLUGIN_PATH_VARIABLE} to it (docs/configs.md 7)"
+                    raise InputError(
+                        f"method '{variant.name}' uses '{name}' of {kind}, which this process registered",
+                        "components that worker processes find",
+                        f"Set {registry.PLUGIN_PATH_VARIABLE} to a file that defines COMPONENTS (docs/configs.md 7)",
                     )
-                    raise InputError(seen, "components that worker processes find", do)
             usual, used = (_split(each) for each in (_config(scene, variant.method, scene.overrides), config))
             label = scene.name if used in (None, usual) else f"{scene.name}-{used}"
             reader = config.datamanager

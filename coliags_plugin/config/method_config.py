@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
@@ -223,7 +224,7 @@ def method_tree(method: str, overrides: Iterable[str] = ()) -> Node:
 
 def _find(method: str, folder: Path, descendants: tuple[Path, ...]) -> Path:
     if is_path(method):
-        path = (folder / user_path(method)).resolve()
+        path = Path(os.path.abspath(folder / user_path(method)))
         if not path.is_file():
             known = [file.name for file in path.parent.glob("*.y*ml") if file not in descendants] + [*method_files()]
             hint = did_you_mean(path.name, known) or "See `coliags list methods`"

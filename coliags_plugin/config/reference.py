@@ -10,6 +10,7 @@ from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
+from pydantic.fields import FieldInfo
 from pydantic_core import to_jsonable_python
 
 from coliags_plugin.core.components import Component
@@ -19,7 +20,8 @@ _NAMES = {int: "integer", float: "number", bool: "true or false", str: "text", t
 _BOUNDS = {"ge": ">=", "gt": ">", "le": "<=", "lt": "<", "min_length": "at least"}
 #: Comments on lines of their own, then an option, on one line or several, and the comment or string behind it.
 _OPTION = re.compile(
-    r'((?:^    #.*\n)*)^    (\w+): (?:.*[(\[]\n(?: {8}.*\n)*    [)\]].*?|.*?)(?:  # (.*)|\n    """([^"]*)""")?$',
+    r"((?:^    #.*\n)*)^    (\w+): (?:.*[(\[]\n(?: {8}.*\n)*    [)\]].*?|.*?)"
+    r'(?: +#(?! *(?:noqa|type:)) *(.*)|\n    """([^"]*)""")?$',
     re.MULTILINE,
 )
 
@@ -40,15 +42,16 @@ def options_of(target: object) -> list[dict[str, Any]]:
         {
             "name": name,
             "type": type_text(field.annotation, field.metadata),
-            **(
-                {}
-                if field.is_required()
-                else {"default": to_jsonable_python(field.get_default(call_default_factory=True))}
-            ),
+            **_default(field),
             "meaning": told.get(name, ""),
         }
         for name, field in settings.model_fields.items()
     ]
+
+
+def _default(field: FieldInfo) -> dict[str, Any]:
+    default = field.get_default(call_default_factory=True)
+    return {} if field.is_required() else {"default": to_jsonable_python(default)}
 
 
 def type_text(annotation: Any, metadata: Sequence[Any] = ()) -> str:
@@ -68,11 +71,10 @@ def type_text(annotation: Any, metadata: Sequence[Any] = ()) -> str:
         text = f"list of {type_text(args[0])}" if ... in args else f"[{', '.join(map(type_text, args))}]"
     elif origin is not None and issubclass(origin, Mapping):
         text = f"entries, each {type_text(args[1])}"
+    elif isinstance(annotation, type) and issubclass(annotation, Settings):
+        text = "options below"
     else:
-        is_nested = isinstance(annotation, type) and issubclass(annotation, Settings)
-        text = (
-            "options below" if is_nested else _NAMES.get(annotation, getattr(annotation, "__name__", str(annotation)))
-        )
+        text = _NAMES.get(annotation, getattr(annotation, "__name__", str(annotation)))
     # A Field inside Annotated holds its bounds in a list.
     limits = [limit for each in metadata for limit in getattr(each, "metadata", [each])]
     bounds = [(sign, getattr(limit, name, None)) for limit in limits for name, sign in _BOUNDS.items()]
@@ -91,7 +93,5 @@ def meanings(settings: type[Settings]) -> dict[str, str]:
         for above, name, behind, below in _OPTION.findall(source):
             found[name] = below or behind or re.sub(r"^    #:?", "", above, flags=re.MULTILINE) or found.get(name, "")
     found |= {name: field.description for name, field in settings.model_fields.items() if field.description}
-    texts = {
-        name: " ".join(found[name].replace("``", "`").split()) for name in settings.model_fields if found.get(name)
-    }
-    return {name: f"{text[0].upper()}{text[1:].removesuffix('.')}." for name, text in texts.items()}
+    texts = {name: " ".join(found.get(name, "").replace("``", "`").split()) for name in settings.model_fields}
+    return {name: f"{text[0].upper()}{text[1:].removesuffix('.')}." for name, text in texts.items() if text}

@@ -189,7 +189,7 @@ def test_a_kind_and_a_component_are_described(capsys):
     assert re.search(r"^l1 +Mean absolute difference over valid pixels", capsys.readouterr().out, re.MULTILINE)
     assert run("list", "appearance_heads", "imia") == 0
     printed = capsys.readouterr().out
-    assert printed.startswith("imia (built in): Improved appearance Modelling")
+    assert printed.startswith("imia (built in): Improved Appearance Modeling")
     assert (
         "\nbias_init    one of scene_distances, pytorch  scene_distances  Initial biases of hidden units.\n" in printed
     )

@@ -77,14 +77,16 @@ def test_a_plugin_file_is_a_module_with_its_source_and_is_recorded_with_its_hash
     plugin.write_text(
         "from __future__ import annotations\n"
         "from coliags_plugin.core.settings import Configurable, Settings\n\n\n"
-        "class MineSettings(Settings):\n    size: int | None = None  # edge, pixels\n\n\n"
+        "class MineSettings(Settings):\n    size: int | None = None # edge, pixels\n    step: int = 3  # noqa: X\n\n\n"
         "class Mine(Configurable[MineSettings]): pass\n\n\nCOMPONENTS = {'fields': {'mine': Mine}}\n"
     )
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLIAGS_PLUGIN_PATH", "mine.py")
     registry = Registry("fields", {}, "thing")
-    (option,) = options_of(registry.get("mine"))
-    assert option == {"name": "size", "type": "integer or null", "default": None, "meaning": "Edge, pixels."}
+    assert options_of(registry.get("mine")) == [
+        {"name": "size", "type": "integer or null", "default": None, "meaning": "Edge, pixels."},
+        {"name": "step", "type": "integer", "default": 3, "meaning": ""},
+    ]
     digest = hashlib.sha256(plugin.read_bytes()).hexdigest()
     origin = {
         "class": "COLIAGS_PLUGIN_PATH.mine:Mine",
