@@ -189,7 +189,7 @@ def test_metres_are_refused_and_on_purpose_train_and_see_an_image(tmp_path, meth
     assert trainer.method.config.near_plane == 0.0001
     trainer.start()
     row = trainer.take_step()
-    output, *_ = trainer._render(trainer.sampler.next())
+    output = trainer.render_step().output
     assert row["gaussians"] > 100 and output.alpha.mean() > 0.3
 
 
