@@ -29,7 +29,7 @@ demo: install
 	@$(BIN)/coliags eval $(DEMO)/coliags-plus
 	@$(BIN)/coliags eval $(DEMO)/scaffold-gs-depth
 	@echo "5/5  the report ..."
-	@$(BIN)/coliags report $(DEMO)/coliags-plus $(DEMO)/scaffold-gs-depth --output $(DEMO)/report.html \
+	@$(BIN)/coliags report $(DEMO)/coliags-plus $(DEMO)/scaffold-gs-depth --output $(DEMO)/report.html --overwrite \
 	  --title "coliags-plus and Scaffold-GS on a synthetic colon" \
 	  --note "A demonstration: $(DEMO_STEPS) steps on a CPU, where the paper trains 30,000."
 
@@ -56,7 +56,7 @@ docs: install-dev $(VENV)/installed-docs
 
 # What docs/results.md has of phantoms-test, from nothing: runs, archive, tables and picture. Some two core hours.
 results: install-dev
-	$(BIN)/coliags ablate rivals-in-time --scenes phantoms-test --threads 1 --output $(RESULTS)/phantoms \
+	$(BIN)/coliags compare rivals-in-time --scenes phantoms-test --threads 1 --output $(RESULTS)/phantoms \
 	  --reference coliags-plus --primary psnr depth_mse_inner
 	$(BIN)/python docs/tools/results.py pack $(RESULTS)/phantoms
 	$(BIN)/python docs/tools/results.py tables

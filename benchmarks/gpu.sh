@@ -3,8 +3,9 @@
 #
 #     benchmarks/gpu.sh [--out FOLDER] [--minutes 45] [--device cuda] [--small]
 #
-# coliags doctor; the tests marked gpu; rasterizers, their speed and their differences; a training step of each method;
-# frames per second; a comparison over all GPUs; and whole runs of each method on a phantom, as many as there is time for.
+# coliags check installation; the tests marked gpu; rasterizers, their speed and their differences; a training step of
+# each method; frames per second; a comparison over all GPUs; and whole runs of each method on a phantom, as many as
+# there is time for.
 # FOLDER, gpu-results by default, gets summary.md, parts.jsonl with status and seconds of each part, the messages of each
 # part in PART.log, its figures in PART.json, and the report of the runs. A part that fails does not end the others.
 # PYTHON names the interpreter; nothing is installed. --small, of sizes that take seconds, is for tests of this file.
@@ -64,7 +65,7 @@ done
 methods+=(reim-nerf)
 [[ $small ]] && methods=(coliags 3dgs)
 
-part doctor 600 "${coliags[@]}" doctor --device "$device"
+part installation 600 "${coliags[@]}" check installation --device "$device"
 fast=triton pytest=(-m gpu)
 if [[ $device == cpu ]]; then
   fast=cpu pytest=(--collect-only -m gpu tests/checks)
@@ -95,7 +96,8 @@ if part phantom 300 "${coliags[@]}" phantom --output "$out/phantom" --overwrite 
   done
   if ((${#evaluated[@]})); then
     reserve=0
-    part report 120 "${coliags[@]}" report "${evaluated[@]}" --output "$out/report.html" --format html --format markdown
+    part report 120 "${coliags[@]}" report "${evaluated[@]}" --output "$out/report.html" \
+      --format html markdown --overwrite
   fi
 fi
 cat "$details" >>"$out/summary.md"

@@ -1,7 +1,7 @@
 """Errors of the mesh fused from the depth of a scene itself, as if a run had rendered it.
 
 ``python benchmarks/mesh_depth.py SCENE PHANTOM [NAME=VALUE ...]`` takes the scene of estimated depth that ``coliags
-depth estimate PHANTOM`` writes, or the phantom for exact depth, and options of meshing; it prints the errors against
+depth PHANTOM`` writes, or the phantom for exact depth, and options of meshing; it prints the errors against
 the surface that the phantom's frames show.
 """
 

@@ -6,20 +6,32 @@ from typing import TYPE_CHECKING, Any
 from coliags_plugin.core import __version__
 
 if TYPE_CHECKING:
-    from coliags_plugin.api.comparing import ablate, compare, report, variant
-    from coliags_plugin.api.runs import Run, import_splats, load_run, train
-    from coliags_plugin.api.scenes import load_scene, make_phantom, reconstruct
+    from coliags_plugin.api.comparing import compare, report, variant
+    from coliags_plugin.api.runs import Run, import_splats, load_run, open_training, train
+    from coliags_plugin.api.scenes import (
+        check_data,
+        estimate_depth,
+        estimate_poses,
+        load_scene,
+        make_phantom,
+        reconstruct,
+    )
+    from coliags_plugin.core.registry import register
 
 __all__ = [
     "Run",
     "__version__",
-    "ablate",
+    "check_data",
     "compare",
+    "estimate_depth",
+    "estimate_poses",
     "import_splats",
     "load_run",
     "load_scene",
     "make_phantom",
+    "open_training",
     "reconstruct",
+    "register",
     "report",
     "train",
     "variant",
@@ -27,17 +39,18 @@ __all__ = [
 
 #: Names of the API by its modules.
 _MODULES = {
-    "comparing": ("ablate", "compare", "report", "variant"),
-    "runs": ("Run", "import_splats", "load_run", "train"),
-    "scenes": ("load_scene", "make_phantom", "reconstruct"),
+    "api.comparing": ("compare", "report", "variant"),
+    "api.runs": ("Run", "import_splats", "load_run", "open_training", "train"),
+    "api.scenes": ("check_data", "estimate_depth", "estimate_poses", "load_scene", "make_phantom", "reconstruct"),
+    "core.registry": ("register",),
 }
 
 
 def __getattr__(name: str) -> Any:
-    """A name of :mod:`coliags_plugin.api`, imported on first use, so that importing the package takes no time."""
+    """A name of the API, imported on first use, so that importing the package takes no time."""
     for module, names in _MODULES.items():
         if name in names:
-            return getattr(import_module(f"coliags_plugin.api.{module}"), name)
+            return getattr(import_module(f"coliags_plugin.{module}"), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 

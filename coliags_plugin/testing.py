@@ -1,4 +1,4 @@
-"""The contract of a method, as a list of checks for plugin authors, pytest and ``coliags check``.
+"""The contract of a method, as a list of checks for plugin authors, pytest and ``coliags check method``.
 
 A test module that checks a method of your own:
 
@@ -439,7 +439,7 @@ def check_images(context: CheckContext) -> None:
     """``coliags render`` writes an image of every kind for every frame."""
     trained, folder = _few_frames(context), context.folder / "renders"
     name, frames = next(iter(trained.scene.test_sets.items()))
-    render_run(trained, RenderOptions(folder, name, video=False, overwrite=True))
+    render_run(trained, RenderOptions(folder, (name,), video=False, overwrite=True))
     kinds = {"rgb", "depth", "rgb_error"} | ({"depth_error"} if frames[0].depth is not None else set())
     paths = [folder / kind / f"{frame.name}.png" for kind in sorted(kinds) for frame in frames]
     missing = [path for path in paths if not path.is_file() or not path.stat().st_size]

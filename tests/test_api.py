@@ -17,10 +17,12 @@ import torch
 
 import coliags_plugin as cp
 from coliags_plugin.config.yaml_tree import parse_assignments
+from coliags_plugin.contracts import Follower, StopTraining
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import read_rgb
+from coliags_plugin.core.registry import losses
 from coliags_plugin.engine.run_folder import RunFolder
-from coliags_plugin.reporting.colormaps import depth_limits, depth_scale_text
+from coliags_plugin.reporting.colormaps import depth_error, depth_limits, depth_scale_text, error_limit
 from coliags_plugin.reporting.image_files import read_depth_tiff
 from tests.commands import run
 from tests.comparison.small import TINY, InlineExecutor
@@ -123,8 +125,9 @@ def test_a_view_shows_truth_and_rendering(trained):
     view = trained.render("0000_color", depth="depth_expected", outputs=["normals"])
     assert view.outputs["normals"].shape == (24, 32, 3)
     scale = depth_scale_text(depth_limits([view.depth, view.true_depth]), "mm")
-    captions = ["truth", "rendered", f"true depth, {scale}", f"depth, {scale}", "depth error, 0 to 2 mm"]
-    assert list(view.images()) == captions
+    captions = ["truth", "rendered", f"true depth, {scale}", f"depth, {scale}"]
+    end = error_limit([depth_error(view.depth, view.true_depth)])
+    assert list(view.images()) == [*captions, f"depth error, 0 to {end:g} mm, by square roots"]
     assert view._repr_html_().count("data:image/png;base64,") == 5
     camera = replace(view.camera, width=16)
     free = trained.render(camera)
@@ -138,6 +141,66 @@ def test_training_resumes(scene, trained, tmp_path):
     assert cut.load().step == 4
     on = cp.train("coliags", scene, tmp_path / "run", steps=6, resume=True)
     assert (before, on.step, cut.load().step) == (8, 6, 6)
+
+
+class Watch(Follower):
+    """Notes what it gets, and ends training at a step."""
+
+    def __init__(self, last):
+        self.last, self.rows, self.steps = last, [], []
+
+    def logged(self, row):
+        self.rows.append(row)
+
+    def stepped(self, step):
+        self.steps.append(step)
+        if step == self.last:
+            raise StopTraining("as far as wanted")
+
+
+def test_a_follower_gets_rows_and_steps_and_ends_a_run_that_is_saved(scene, trained, tmp_path):
+    watch = Watch(last=4)
+    run = cp.train("coliags", scene, tmp_path / "run", steps=8, seed=3, settings=SETTINGS, followers=[watch])
+    assert watch.steps == [1, 2, 3, 4] == [row["step"] for row in watch.rows]
+    for name in ("loss", "psnr"):
+        np.testing.assert_array_equal([row[name] for row in watch.rows], trained.history[name][:4])
+        np.testing.assert_array_equal(run.history[name], trained.history[name][:4])
+    assert run.step == run.evaluate().steps == 4
+    on = cp.train("coliags", scene, run.path, resume=True, followers=[rest := Watch(last=None)])
+    assert rest.steps == [5, 6, 7, 8] and on.step == 8
+
+
+def test_a_method_is_trained_from_a_mapping(scene, trained, tmp_path):
+    mapping = {"name": "mine", "base": "coliags", "field": {"voxel_size": 2.0}, "losses": {"depth": None}}
+    settings = {key: value for key, value in SETTINGS.items() if key != "field.voxel_size"}
+    run = cp.train(mapping, scene, tmp_path / "run", steps=2, settings=settings)
+    assert (run.method, repr(run).partition(" on ")[0]) == ("mine", "mine")
+    expected = trained.config.model_dump()
+    del expected["losses"]["depth"]
+    expected["description"] = ""
+    assert run.config.model_dump() == {**expected, "schedule": {**expected["schedule"], "steps": 2}}
+    assert cp.train(mapping, scene, run.path, steps=3, resume=True).step == 3
+    with pytest.raises(InputError, match="mapping: loses: unknown key"):
+        cp.train({"base": "coliags", "loses": {}}, scene, tmp_path / "other")
+
+
+def test_a_scene_is_checked(scene, tmp_path):
+    check = cp.check_data(scene, tmp_path / "check.html", settings={"frame_step": 2})
+    assert not check.findings and check.facts["depth"]["median"] > 10.0
+    assert repr(check) == str(check) and str(check).endswith("nothing suspect")
+    assert "nothing suspect" in (tmp_path / "check.html").read_text()
+
+
+def test_estimates_that_cannot_be_begun_are_refused(scene, tmp_path):
+    with pytest.raises(InputError, match="`near` without `far`"):
+        cp.estimate_depth(scene, tmp_path / "new", near=12)
+    with pytest.raises(InputError, match="`jobs=0`"):
+        cp.estimate_depth(scene, tmp_path / "new", jobs=0)
+    with pytest.raises(InputError, match="a folder apart from the input"):
+        cp.estimate_poses(scene, scene / "poses")
+    with pytest.raises(InputError, match=r"-2 mm by `diameter` or `distance`\. Expected one length above 0"):
+        cp.estimate_poses(scene / "images", tmp_path / "new", distance=["a", "b", -2])
+    assert not (tmp_path / "new").exists()
 
 
 def test_scenes_are_made_and_read(tmp_path):
@@ -197,8 +260,10 @@ def test_examples_of_the_pages_run(tmp_path, monkeypatch):
 
         return call
 
-    monkeypatch.setattr(cp, "train", quick(cp.train), raising=False)
-    monkeypatch.setattr(cp, "compare", quick(cp.compare), raising=False)
+    for name in ("train", "open_training", "compare"):
+        monkeypatch.setattr(cp, name, quick(getattr(cp, name)), raising=False)
+    for registered in ("_targets", "_sources"):
+        monkeypatch.setattr(losses, registered, dict(vars(losses)[registered]))
     for page in (ROOT / "README", ROOT / "docs" / "api"):
         names = {}
         text = page.with_suffix(".md").read_text(encoding="utf-8")
@@ -283,19 +348,18 @@ def test_what_fails_is_in_the_table(wall, tmp_path, inline, monkeypatch):
     assert "0 of 1 cells done, 1 failed" in repr(comparison)
 
 
-def test_an_ablation_is_a_comparison_of_a_files_variants(wall, tmp_path, inline):
+def test_variants_of_a_file_are_compared_with_methods(wall, tmp_path, inline):
     text = "description: d\nbase: coliags\nvariants: {full: null, plain: [losses.depth=null]}\n"
     (tmp_path / "mine.yaml").write_text(text)
-    comparison = cp.ablate(tmp_path / "mine.yaml", wall, tmp_path / "new", steps=3, settings=TINY_SETTINGS)
-    assert [result.method for result in comparison.results] == ["full", "plain"]
-    with pytest.raises(InputError, match="paper-rows"):
-        cp.ablate("paper-row", wall, tmp_path / "new")
+    methods = ["scaffold-gs", str(tmp_path / "mine.yaml")]
+    comparison = cp.compare(methods, wall, tmp_path / "new", steps=3, settings=TINY_SETTINGS)
+    assert [result.method for result in comparison.results] == ["scaffold-gs", "full", "plain"]
 
 
 def test_a_report_of_a_comparison_is_the_commands(compared, tmp_path):
     ours, theirs = tmp_path / "ours.html", tmp_path / "theirs.html"
-    files = cp.report(compared, ours, formats=["markdown", "csv"], title="Depth")
-    names = ("--format", "markdown", "--format", "csv", "--title", "Depth")
+    files = cp.report(compared, ours, formats=["markdown", "csv"], title="Depth").files
+    names = ("--format", "markdown", "csv", "--title", "Depth")
     assert run("report", compared.folder, "--output", theirs, *names) == 0
     assert [file.suffix for file in files] == [".md", ".csv"]
     for file in files:

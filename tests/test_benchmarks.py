@@ -175,7 +175,7 @@ def gpu_script(folder, *argv, **variables):
 def test_everything_for_a_gpu_runs_on_a_cpu(tmp_path):
     status, parts, summary = gpu_script(tmp_path / "out")
     assert status == 0 and set(parts.values()) == {"ok"}, summary
-    assert list(parts)[:4] == ["doctor", "tests", "rasterizer", "against-torch"] and list(parts)[-1] == "report"
+    assert list(parts)[:4] == ["installation", "tests", "rasterizer", "against-torch"] and list(parts)[-1] == "report"
     assert {"step-coliags", "frames-per-second", "comparison", "run-3dgs", "eval-3dgs"} <= parts.keys()
     assert "| step-coliags | ok |" in summary and "| cpu | surfels | 300 |" in summary and "1 of 1" in summary
     for name in ("rasterizer", "against-torch", "step-3dgs", "frames-per-second"):
@@ -186,7 +186,7 @@ def test_everything_for_a_gpu_runs_on_a_cpu(tmp_path):
 def test_a_part_for_a_gpu_that_fails_is_recorded_and_the_others_run(tmp_path):
     status, parts, summary = gpu_script(tmp_path / "out", "--device", "cuda", PYTHON="false")
     assert status == 1 and set(parts.values()) == {"failed (1)"} and len(parts) > 6
-    assert "## doctor: failed (1)" in summary
+    assert "## installation: failed (1)" in summary
     status, parts, _ = gpu_script(tmp_path / "idle", "--device", "cuda", PYTHON="true")
     assert status == 0 and set(parts.values()) == {"ok"} and list(parts)[-1] == "report"
     status, parts, _ = gpu_script(tmp_path / "late", "--minutes", "0")

@@ -11,16 +11,19 @@ import sys
 from functools import cache
 from pathlib import Path
 from runpy import run_path
-from typing import Any, get_args, get_type_hints
+from typing import Any
 
 import pytest
 import yaml
 
 from coliags_plugin import cli
-from coliags_plugin.cli.methods import CheckCommand, ConfigCommand
+from coliags_plugin.cli.checks import CheckMethodCommand
+from coliags_plugin.cli.methods import ConfigCommand
 from coliags_plugin.cli.runs import TrainCommand
 from coliags_plugin.cli.scenes import PhantomCommand
+from coliags_plugin.cli.texts import depth_commands
 from coliags_plugin.config.method_config import MethodConfig, OptimizerSettings, ScheduleSettings, load_method
+from coliags_plugin.config.reference import meanings, type_text
 from coliags_plugin.core.registry import REGISTRIES
 from coliags_plugin.core.render_output import OUTPUTS
 from coliags_plugin.core.splits import held_out
@@ -141,11 +144,15 @@ def commands() -> list[tuple[str, str]]:
     return typed
 
 
-#: Commands and their actions, which running text names alone.
-ALONE = {
-    f"{name} {action}" for name, kind in cli.COMMANDS.items() for action in get_args(get_type_hints(kind).get("action"))
-}
-ALONE |= set(cli.COMMANDS)
+@pytest.mark.parametrize("page", ["../README.md", "data.md", "depth.md", "poses.md", "layouts/c3vd-v2.md"])
+def test_pages_tell_the_same_way_to_depth_as_messages(page):
+    lines = [line for block in fenced(DOCS / page, "sh") for line in block.splitlines()]
+    for command in depth_commands(Path("SCENE")):
+        assert any(line.startswith(command) for line in lines)
+
+
+#: Commands that running text names alone.
+ALONE = {*cli.COMMANDS, "check method", "check installation"}
 #: Methods that docs/example_package adds; tests/test_third_party_package.py trains them.
 OF_THE_EXAMPLE = {path.stem for path in (DOCS / "example_package").rglob("*.yaml")}
 
@@ -158,8 +165,8 @@ def test_commands_parse(page, command, monkeypatch, capsys):
         argv.append("--help")  # the subcommand's name alone, in running text
     monkeypatch.setattr(cli, "run_command", lambda command: caught.append(command) or 0)
     assert run(*argv) == 0
-    parsed_command = caught[0] if caught else None
-    is_of_method = isinstance(parsed_command, (TrainCommand, ConfigCommand, CheckCommand))
+    parsed_command = getattr(caught[0], "subcommand", caught[0]) if caught else None
+    is_of_method = isinstance(parsed_command, (TrainCommand, ConfigCommand, CheckMethodCommand))
     if is_of_method and parsed_command.method not in OF_THE_EXAMPLE and not parsed_command.method.endswith(".yaml"):
         # A format's page speaks of scenes in that format.
         format_of_page = [f"datamanager.name={Path(page).stem}"] if "layouts" in page else []
@@ -323,7 +330,7 @@ def test_the_page_of_options_has_each_with_its_range_and_meaning(kind):
             rows = re.findall(rf"^\| `{option}` \| (.+) \| (.+) \| (.+) \|$", text, re.MULTILINE)
             assert rows, f"{name}: {option} is not there"
             assert any(
-                range_text.startswith(tool("options")["type_text"](field).replace("|", "\\|"))
+                range_text.startswith(type_text(field.annotation, field.metadata).replace("|", "\\|"))
                 for range_text, _, _ in rows
             )
             for limit in field.metadata:
@@ -338,8 +345,9 @@ def test_the_page_of_options_has_the_settings_of_commands_with_their_meaning():
     for name, settings in tool("options")["COMMANDS"].items():
         section = text.split(f"\n### {name}\n")[1].split("\n### ")[0]
         for option, field in settings.model_fields.items():
-            assert f"| `{option}` | {tool('options')['type_text'](field)} | " in section, f"{name}: {option}"
-            assert tool("options")["meanings"](settings)[option] in section
+            row = f"| `{option}` | {type_text(field.annotation, field.metadata)} | "
+            assert row in section, f"{name}: {option}"
+            assert tool("options")["as_markdown"](meanings(settings)[option]) in section
 
 
 @pytest.mark.parametrize("name", METHODS)

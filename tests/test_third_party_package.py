@@ -68,7 +68,7 @@ def test_the_example_trains_and_is_evaluated(coliags, tmp_path):
 
 @pytest.mark.thorough
 def test_the_example_keeps_the_contract(coliags, tmp_path):
-    process = coliags("check", "round-gaussians")
+    process = coliags("check", "method", "round-gaussians")
     assert process.returncode == 0, process.stdout + process.stderr
     assert "19 passed, 0 failed, 2 skipped" in process.stdout
 
@@ -88,7 +88,7 @@ def test_a_method_whose_file_is_missing_is_named(coliags, tmp_path):
 def test_a_renderer_of_another_package_is_registered(coliags):
     process = coliags("list", "renderers")
     assert process.returncode == 0, process.stderr
-    assert "(entry point coliags_gsplat:GsplatRenderer)" in process.stdout
+    assert "(entry point coliags_gsplat:GsplatRenderer of coliags_gsplat 1.0)" in process.stdout
     renderer = renderer_class()
     assert renderer.obstacle("gaussians3d", torch.device("cpu")) == "runs on cuda, the device is cpu"
     assert "depth_expected" in renderer.outputs_of("gaussians3d") and "surfels" not in renderer.primitives

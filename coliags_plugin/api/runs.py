@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -36,6 +37,7 @@ if TYPE_CHECKING:
     from coliags_plugin.core.cameras import Camera
     from coliags_plugin.core.scenes import Scene
     from coliags_plugin.engine.trained import TrainedRun
+    from coliags_plugin.engine.trainer import Trainer
     from coliags_plugin.export.baking.exporting import Exported
     from coliags_plugin.export.viewer.live import Viewer
     from coliags_plugin.export.viewer.page import ScenePage
@@ -151,7 +153,7 @@ class Run:
         """
         from coliags_plugin.engine.rendering import choose_frames
 
-        return [frame.name for frame in choose_frames(self.load().scene, frames)]
+        return [frame.name for frame in choose_frames(self.load().scene, [frames])]
 
     def render(
         self, frame: str | Camera, *, depth: str = "depth_accumulated", outputs: Sequence[str] = ()
@@ -172,7 +174,7 @@ class Run:
 
     @takes(RenderOptions)
     def write_renders(self, options: RenderOptions) -> Path:
-        """Write colour, depth and error images of a set of frames, and a video along the trajectory; their folder.
+        """Write colour, depth and error images of frames, and a video along the trajectory; their folder.
 
         Raises:
             InputError: See :meth:`load`; no such frames or channel; the file is no camera path; or the folder exists or
@@ -202,14 +204,9 @@ class Run:
         folder = options.output or self.path / "mesh"
         return mesh_run(self.load(), folder, settings, options.formats, options.truth, options.overwrite)
 
-    def export(self, output: ExportOptions | str | Path | None = None, *formats: str, **options: Any) -> list[Exported]:
+    @takes(ExportOptions)
+    def export(self, options: ExportOptions) -> list[Exported]:
         """Write the run's Gaussians to files, and a JSON record of each to ``FILE.json`` beside it.
-
-        Args:
-            output: The file; of several formats, its suffix becomes that of each. None: ``export/SCENE.FORMAT`` in the
-                run folder.
-            formats: Names of formats (docs/export.md 1); none: ``ply``.
-            options: Others of :class:`~coliags_plugin.config.options.ExportOptions`.
 
         Raises:
             InputError: See :meth:`load`; the method has no Gaussians, the run was relit, there is no such format or
@@ -217,9 +214,7 @@ class Run:
         """
         from coliags_plugin.export.baking.exporting import export_run
 
-        values: Any = {"output": output, "formats": formats or ("ply",), **options}
-        chosen = output if isinstance(output, ExportOptions) else ExportOptions(**values)
-        return export_run(self.load(), chosen)
+        return export_run(self.load(), options)
 
     @takes(CoverageOptions)
     def coverage(self, options: CoverageOptions) -> MeasuredCoverage:
@@ -311,53 +306,65 @@ load_run = Run
 
 
 @takes(TrainOptions)
-def train(options: TrainOptions, *, view_port: int | None = None) -> Run:
-    """Train a method on a scene.
+@contextmanager
+def open_training(options: TrainOptions) -> Iterator[Trainer]:
+    """Trainer of a run, for a loop of your own over its steps (docs/api.md 4), until the block ends.
 
     Images, poses and depth that contradict each other, as far as that is quickly seen, are warned of.
 
-    Args:
-        options: See below; settings by key path, for instance ``{"field.voxel_size": 1.0}``.
-        view_port: Port at which browsers see the run while it is trained; None: they do not; 0: any free one.
-
     Raises:
-        InputError: Method, data or options are invalid or do not fit each other, or a logger's library is missing;
-            nothing was written.
-        InterruptedRunError: Ctrl-C, SIGTERM or SIGHUP, after the state was saved.
-        NotFiniteError: A loss or parameter became NaN or infinite.
+        InputError: Method, data or options are invalid or do not fit each other; nothing was written.
     """
+    from coliags_plugin.engine import trainer as engine
     from coliags_plugin.engine.devices import choose_device
-    from coliags_plugin.engine.loggers import find_loggers
-    from coliags_plugin.engine.trainer import IfExists, open_training
 
     if options.resume and options.overwrite:
         raise InputError("`resume=True` and `overwrite=True` together", "one of them")
-    on = choose_device(options.device)
+    device, folder = choose_device(options.device), _run_folder(options)
+    if_exists: engine.IfExists = "resume" if options.resume else "overwrite" if options.overwrite else "refuse"
+    with engine.open_training(options, folder, device, if_exists) as trainer:
+        if not options.resume:
+            warn_of_suspect_data(trainer.scene)
+        yield trainer
+
+
+@takes(TrainOptions)
+def train(options: TrainOptions, *, followers: Sequence[Follower] = (), view_port: int | None = None) -> Run:
+    """Train a method on a scene, with the warnings of :func:`open_training`.
+
+    Args:
+        options: See below; settings by key path, for instance ``{"field.voxel_size": 1.0}``.
+        followers: Told of steps and rows of the log; each may end training (docs/api.md 3).
+        view_port: Port at which browsers see the run while it is trained; None: they do not; 0: any free one.
+
+    Raises:
+        InputError: See :func:`open_training`; or a logger's library is missing.
+        InterruptedRunError: Ctrl-C, SIGTERM or SIGHUP, after the state was saved.
+        NotFiniteError: A loss or parameter became NaN or infinite.
+    """
+    from coliags_plugin.engine.loggers import find_loggers
+
     chosen_loggers = find_loggers(options.loggers)
     if view_port is not None:
         from coliags_plugin.export.viewer.live import check_server
 
         check_server("127.0.0.1", view_port)
-    folder = _run_folder(options)
-    if_exists: IfExists = "resume" if options.resume else "overwrite" if options.overwrite else "refuse"
-    with open_training(options, folder, on, if_exists) as trainer:
-        if not options.resume:
-            warn_of_suspect_data(trainer.scene)
+    with open_training(options) as trainer:
+        run, config = trainer.run.path, trainer.method.config.model_dump()
         title = f"{trainer.method.name} on {trainer.scene.name}, seed {trainer.seed}"
-        config = trainer.method.config.model_dump()
-        followers: list[Follower] = [logger(folder.path, title, config, trainer.step) for logger in chosen_loggers]
+        observers = [*followers, *(logger(run, title, config, trainer.step) for logger in chosen_loggers)]
         if view_port is not None:
             from coliags_plugin.export.viewer.live import Viewer
 
             viewer = Viewer.of_training(trainer, view_port)
             log.info("%s shows the run until training ends", viewer.url)
-            followers.append(viewer)
-        trainer.train(followers=followers)
-    return Run(folder.path, data=options.data, device=options.device)
+            observers.append(viewer)
+        trainer.train(followers=observers)
+    return Run(run, data=options.data, device=options.device)
 
 
 def warn_of_suspect_data(scene: Scene) -> None:
-    """Warn of what the quick checks of ``coliags data check`` find, in the lengths of the dataset."""
+    """Warn of what the quick checks of ``coliags check data`` find, in the lengths of the dataset."""
     from coliags_plugin.checks.data.check import check_scene
 
     stored = scene.scaled(1.0 / scene.provenance.training_scale)

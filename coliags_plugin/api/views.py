@@ -17,12 +17,12 @@ from coliags_plugin.core.scenes import Frame, Scene
 from coliags_plugin.engine import rendering
 from coliags_plugin.engine.trained import TrainedRun
 from coliags_plugin.reporting.colormaps import (
-    DEPTH_ERROR_LIMIT_MM,
     colorize_depth,
     colorize_error,
     depth_error,
     depth_limits,
     depth_scale_text,
+    error_limit,
 )
 from coliags_plugin.reporting.image_files import EncodedImage, as_array, eight_bit
 
@@ -44,7 +44,6 @@ class RenderedView:
         true_rgb: Recorded colours; None for a free camera, and under another lamp. [H, W, 3]
         true_depth: True z-depth, mm; NaN where unknown or not to be looked at. None where there is none. [H, W]
         unit: Of depths.
-        error_limit: Depth error of the last colour, in this unit.
     """
 
     name: str
@@ -56,7 +55,6 @@ class RenderedView:
     true_rgb: UInt8[np.ndarray, "H W 3"] | None = field(default=None, repr=False)
     true_depth: Float32[np.ndarray, "H W"] | None = field(default=None, repr=False)
     unit: str = "mm"
-    error_limit: float = DEPTH_ERROR_LIMIT_MM
 
     def images(self) -> dict[str, UInt8[np.ndarray, "H W 3"]]:
         """Truth, rendering, depths on one scale, and depth error as images, by captions. [H, W, 3] each"""
@@ -69,8 +67,9 @@ class RenderedView:
             shown[f"true depth, {scale}"] = colorize_depth(self.true_depth, limits)
         shown[f"depth, {scale}"] = colorize_depth(self.depth, limits)
         if self.true_depth is not None:
-            error, limit = depth_error(self.depth, self.true_depth), self.error_limit
-            shown[f"depth error, 0 to {limit:g} {self.unit}"] = colorize_error(error, limit)
+            error = depth_error(self.depth, self.true_depth)
+            limit = error_limit([error])
+            shown[f"depth error, 0 to {limit:g} {self.unit}, by square roots"] = colorize_error(error, limit)
         return shown
 
     def _repr_html_(self) -> str:
@@ -105,7 +104,6 @@ def view_of(trained: TrainedRun, of: str | Camera, depth: str, outputs: Sequence
         true_rgb=None if frame is None or trained.lamp is not None else as_array(frame.image),
         true_depth=None if frame is None else _true_depth(frame),
         unit=trained.scene.length_unit,
-        error_limit=rendering.error_limit_of(trained),
     )
 
 

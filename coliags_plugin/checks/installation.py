@@ -1,4 +1,4 @@
-"""Check of an installation: libraries, devices, weights, and renderers, which are tried (``coliags doctor``)."""
+"""``coliags check installation``: libraries, devices, weights, and renderers, which are tried."""
 
 from __future__ import annotations
 
@@ -116,7 +116,7 @@ def _renderer(name: str, device: torch.device, tried: torch.device | None) -> st
     except Exception as error:  # of a driver, a compiler or a kernel: the reason in every case
         first = next((line.strip() for line in str(error).splitlines() if line.strip()), "")
         reason = f"{type(error).__name__}: {first[:300]}".rstrip(" .:")
-        raise CheckFailedError(f"{reason}. {_HINT}; the traceback is in `coliags doctor --json`") from error
+        raise CheckFailedError(f"{reason}. {_HINT}; the traceback is in `coliags check installation --json`") from error
 
 
 def _lpips(net: str) -> str:

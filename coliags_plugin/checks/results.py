@@ -1,4 +1,4 @@
-"""Outcomes of checks, and their text: the lines of ``coliags check`` and ``coliags doctor``."""
+"""Outcomes of checks, and their text: the lines of ``coliags check method`` and ``installation``."""
 
 from __future__ import annotations
 

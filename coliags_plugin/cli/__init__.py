@@ -11,7 +11,7 @@ from typing import Annotated, Any, Protocol, Union
 
 import tyro
 
-from coliags_plugin.cli import comparing, methods, poses, runs, scenes
+from coliags_plugin.cli import checks, comparing, methods, poses, runs, scenes
 from coliags_plugin.cli.texts import in_flags, translate_for
 from coliags_plugin.core import __version__
 from coliags_plugin.core.errors import ReportedError
@@ -29,26 +29,22 @@ class Runnable(Protocol):
 COMMANDS: dict[str, type[Runnable]] = {
     "reconstruct": scenes.ReconstructCommand,
     "phantom": scenes.PhantomCommand,
+    "poses": poses.PosesCommand,
+    "depth": scenes.DepthCommand,
     "train": runs.TrainCommand,
+    "import": runs.ImportCommand,
     "eval": runs.EvaluateCommand,
     "render": runs.RenderCommand,
-    "coverage": runs.CoverageCommand,
     "mesh": runs.MeshCommand,
+    "coverage": runs.CoverageCommand,
     "export": runs.ExportCommand,
-    "import": runs.ImportCommand,
     "view": runs.ViewCommand,
     "compare": comparing.CompareCommand,
-    "ablate": comparing.AblateCommand,
     "report": comparing.ReportCommand,
-    "results": comparing.ResultsCommand,
-    "poses": poses.PosesCommand,
     "list": methods.ListCommand,
     "config": methods.ConfigCommand,
-    "data": scenes.DataCommand,
-    "depth": scenes.DepthCommand,
-    "check": methods.CheckCommand,
+    "check": checks.CheckCommand,
     "weights": methods.WeightsCommand,
-    "doctor": methods.DoctorCommand,
 }
 #: Any of them, for tyro.
 Command: Any = Union[tuple(Annotated[kind, tyro.conf.subcommand(name)] for name, kind in COMMANDS.items())]  # noqa: UP007

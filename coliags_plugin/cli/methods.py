@@ -1,16 +1,10 @@
-"""Commands on methods and the installation: ``coliags list``, ``config show``, ``check``, ``doctor``, ``weights``."""
+"""Commands on what is there: ``coliags list``, ``config`` and ``weights``."""
 
 from __future__ import annotations
 
-import logging
-import shutil
-import sys
-import tempfile
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
-from io import TextIOWrapper
-from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
@@ -21,28 +15,30 @@ from coliags_plugin.config import options
 
 @dataclass(frozen=True)
 class ListCommand:
-    """List methods, benchmarks and registered components."""
+    """List methods, benchmarks and registered components, or the options of one component."""
 
-    kind: tyro.conf.Positional[str] = "all"
-    """A kind (methods, benchmarks, ablations, datamanagers, fields, renderers, ...); default: all of them."""
+    kind: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="[KIND]")] = "all"
+    """A kind (methods, benchmarks, ablations, datamanagers, fields, renderers, ...), or all of them."""
+    name: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="[NAME]")] = ""
+    """A component of that kind, of which to print the options and default learning rates."""
     json: options.AsJson = False
 
     def run(self) -> None:
-        """Print names by kind, with the source of those that are not built in."""
+        """Print names by kind, with the source of those that are not built in, or a description of a component."""
         from coliags_plugin.comparison.named_files import ABLATIONS, shipped
         from coliags_plugin.config.method_config import descriptions, method_files
         from coliags_plugin.core.errors import check_name
         from coliags_plugin.core.registry import REGISTRIES
 
-        def sources(kind: str) -> dict[str, str]:
-            named = {name: REGISTRIES[kind].source(name) for name in REGISTRIES[kind]}
-            return {name: "" if source == "built in" else f"({source})" for name, source in named.items()}
-
+        if self.name:
+            check_name("kind of components", self.kind, REGISTRIES)
+            self._describe()
+            return
         texts: dict[str, Callable[[], dict[str, str]]] = {
             "methods": lambda: descriptions(method_files()),
             "benchmarks": lambda: descriptions(shipped()),
             "ablations": lambda: descriptions(shipped(ABLATIONS)),
-            **{kind: partial(sources, kind) for kind in REGISTRIES},
+            **{kind: partial(self._components, kind) for kind in REGISTRIES},
         }
         check_name("kind", self.kind, ("all", *texts))
         listed = {kind: texts[kind]() for kind in (texts if self.kind == "all" else [self.kind])}
@@ -53,116 +49,76 @@ class ListCommand:
             lines += [f"{indent}{name:<28}{text}".rstrip() for name, text in rows.items()]
         print_summary("\n".join(lines), listed, as_json=self.json)
 
+    def _components(self, kind: str) -> dict[str, str]:
+        """Source of each component that is not built in, behind what it is if one kind is listed, which imports it."""
+        from coliags_plugin.config.reference import plain_doc
+        from coliags_plugin.core.errors import InputError
+        from coliags_plugin.core.registry import REGISTRIES
+
+        texts = {}
+        for name in REGISTRIES[kind]:
+            source = REGISTRIES[kind].source(name)
+            try:
+                text = plain_doc(REGISTRIES[kind].get(name), "\n") if kind == self.kind else ""
+            except InputError as error:
+                text = error.seen
+            texts[name] = text if source == "built in" else f"{text} ({source})".strip()
+        return texts
+
+    def _describe(self) -> None:
+        from coliags_plugin.config.reference import options_of, plain_doc
+        from coliags_plugin.config.yaml_tree import dump_inline
+        from coliags_plugin.core.registry import REGISTRIES
+        from coliags_plugin.reporting.model import Column
+        from coliags_plugin.reporting.text_formats import DisplayTable
+
+        registry = REGISTRIES[self.kind]
+        target, source = registry.get(self.name), registry.source(self.name)
+        described, choices, rates = plain_doc(target), options_of(target), getattr(target, "rates", {})
+        tables = {
+            ("option", "type", "default", "meaning"): [
+                {
+                    **each,
+                    "option": each["name"],
+                    "default": dump_inline(each["default"]) if "default" in each else "required",
+                }
+                for each in choices
+            ],
+            ("parameter group", "default rate"): [
+                {"parameter group": group, "default rate": dump_inline(rate)} for group, rate in rates.items()
+            ],
+        }
+        parts = [": ".join(filter(None, (f"{self.name} ({source})", described)))]
+        for keys, rows in tables.items():
+            parts += [str(DisplayTable("", [Column(key, words=True) for key in keys], rows))] if rows else []
+        facts = {"description": described, "source": source, "options": choices, "parameter_groups": rates}
+        print_summary("\n\n".join(parts), {"kind": self.kind, "name": self.name, **facts}, as_json=self.json)
+
 
 @dataclass(frozen=True)
 class ConfigCommand:
-    """Show a method config with everything inherited and every default filled in."""
+    """Show a method config with everything inherited, where each value comes from, and what it means."""
 
-    action: tyro.conf.Positional[Literal["show"]]
-    """Action."""
-    method: tyro.conf.Positional[str]
-    """Name of a method or path of a YAML file."""
-    origin: bool = False
-    """Also print the file and line, option or default that each value comes from."""
+    method: options.Method
+    """Name of a method (`coliags list methods`) or path of a YAML file."""
     set: options.Assignments = ()
     """Change a value, as for train."""
 
     def run(self) -> None:
-        """Print YAML."""
+        """Print YAML, with comments."""
         from coliags_plugin.config.method_config import load_method
 
-        loaded = load_method(self.method, self.set)
-        print(in_flags(loaded.with_origins()) if self.origin else loaded.config.to_yaml(), end="")
-
-
-@dataclass(frozen=True)
-class CheckCommand:
-    """Check that a method trains, resumes, renders and fails as it should, on the CPU; exit status 1 if not."""
-
-    method: tyro.conf.Positional[str]
-    """Name of a method (`coliags list methods`) or path of a YAML file."""
-    steps: int = 20
-    """Length of the runs; schedules are scaled to it."""
-    keep: bool = False
-    """Keep the folder with the phantom and the runs, and print its path."""
-    traceback: bool = False
-    """Print the whole traceback of every exception."""
-    set: options.Assignments = ()
-    """Change a value of the method config, as for train."""
-    data_format: options.DataFormat = None
-    data: options.OptionalPath = None
-    """A scene's folder; default: a small phantom."""
-    json: options.AsJson = False
-
-    def run(self) -> None:
-        """Print one line per check, then a summary."""
-        logger = logging.getLogger("coliags_plugin")
-        level, folder = logger.level, Path(tempfile.mkdtemp(prefix="coliags-check-"))
-        logger.setLevel(logging.WARNING)  # the plans of a dozen runs
-        try:
-            failed = self._print_results(folder)
-        finally:
-            logger.setLevel(level)
-            if not self.keep:
-                shutil.rmtree(folder, ignore_errors=True)
-        if failed:
-            sys.exit(1)
-
-    def _print_results(self, folder: Path) -> bool:
-        """Print each result; True if a check failed."""
-        from coliags_plugin.checks.results import line, summary, tracebacks
-        from coliags_plugin.testing import METHOD_CHECKS, CheckContext, name_of_check
-
-        if isinstance(sys.stdout, TextIOWrapper):
-            sys.stdout.reconfigure(errors="backslashreplace")  # where an encoding has no ticks
-        width = max(len(name_of_check(check)) for check in METHOD_CHECKS)
-        context = CheckContext(self.method, folder, self.set, self.data, self.data_format, self.steps)
-        results = []
-        for check in METHOD_CHECKS:
-            results.append(context.outcome(check))
-            if not self.json:
-                print(in_flags(line(results[-1], width)), flush=True)
-        text = summary(results)
-        if self.traceback:
-            text += "\n" + "".join(tracebacks(results))
-        facts = {"checks": [asdict(result) for result in results]}
-        print_summary(text, facts, written=[folder] if self.keep else [], as_json=self.json)
-        return any(result.status == "failed" for result in results)
-
-
-@dataclass(frozen=True)
-class DoctorCommand:
-    """Report versions and devices, which renderer would be used and why, and where the weights of LPIPS are.
-
-    On a CUDA device the renderers are tried: their errors on small views, and frames per second.
-    """
-
-    device: Annotated[str, tyro.conf.arg(metavar="auto|cpu|cuda|cuda:N")] = "auto"
-    """Device whose renderers are tried; auto: the first CUDA device, or none."""
-    json: options.AsJson = False
-
-    def run(self) -> None:
-        """Print the results; exit with status 1 where a requirement is missing or a renderer is wrong."""
-        from coliags_plugin.checks.installation import check_installation
-        from coliags_plugin.reporting.model import Fact, FactList
-        from coliags_plugin.reporting.text_formats import terminal_text
-
-        results = check_installation(self.device)
-        marks = {"passed": "ok ", "failed": "BAD", "skipped": "-  "}
-        facts = [Fact(f"{marks[each.status]} {each.name}", each.detail) for each in results]
-        text = terminal_text([FactList(facts)])
-        print_summary(text, {"checks": [asdict(each) for each in results]}, as_json=self.json)
-        if any(each.status == "failed" for each in results):
-            sys.exit(1)
+        print(in_flags(load_method(self.method, self.set).annotated()), end="")
 
 
 @dataclass(frozen=True)
 class WeightsCommand:
     """Download the weights that LPIPS needs, or copy them; nothing else in this package downloads."""
 
-    metric: tyro.conf.Positional[Literal["lpips"]]
-    """Whose weights."""
-    net: Literal["vgg", "alex", "squeeze", "all"] | None = None
+    net: Annotated[
+        Literal["vgg", "alex", "squeeze", "all"] | None,
+        tyro.conf.arg(metavar="{vgg,alex,squeeze,all}", help_behavior_hint=""),
+    ] = None
     """Backbone: VGG's has 528 MiB, AlexNet's 233, SqueezeNet's 5; default: vgg and squeeze, for the protocol paper."""
     folder: options.OptionalPath = None
     """Folder to install them in; default: torch's download cache, where LPIPS finds them."""

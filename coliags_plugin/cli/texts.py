@@ -64,7 +64,7 @@ def print_summary(
     ``facts`` say the same as ``text`` in JSON values; ``then`` are commands to type next.
     """
     if as_json:
-        values = ({"summary": text} if text else {}) if facts is None else facts
+        values = ({"summary": in_flags(text)} if text else {}) if facts is None else facts
         summary = {**values, "written": [str(path) for path in written], "next": list(then)}
         print(json.dumps(summary, indent=2, allow_nan=False, default=str))
         return
@@ -91,7 +91,10 @@ def train_command(scene: Path, assignments: Sequence[str] = ()) -> str:
     return coliags("train", "coliags-plus", "--data", scene, *changes)
 
 
-def depth_commands(scene: Path) -> list[str]:
-    """The commands that estimate the depth of a scene with poses and points, and train on it."""
+def depth_commands(scene: Path, reading: Sequence[str] = (), training: Sequence[str] = ()) -> list[str]:
+    """The commands of ``TO_GET_DEPTH``: estimate the depth of a scene with poses, and train on it.
+
+    ``reading`` are flags with which the scene is read, ``training`` options ``KEY=VALUE`` of training.
+    """
     with_depth = scene.with_name(f"{scene.name}-depth")
-    return [coliags("depth", "estimate", scene, "--output", with_depth), train_command(with_depth)]
+    return [coliags("depth", scene, "--output", with_depth, *reading), train_command(with_depth, training)]

@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import logging
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import get_args
 
 from coliags_plugin.comparison.folder import ComparisonFolder
-from coliags_plugin.comparison.named_files import Variant
+from coliags_plugin.comparison.named_files import Variant, variants_of
 from coliags_plugin.comparison.plan import ComparisonCell, FailureRecord, make_cells
 from coliags_plugin.comparison.scenes import find_scenes, make_phantoms
 from coliags_plugin.comparison.worker import CellTask
-from coliags_plugin.config.method_config import is_path, method_name
+from coliags_plugin.config.method_config import Method, is_path, method_text
 from coliags_plugin.config.options import CompareOptions
 from coliags_plugin.core import registry
 from coliags_plugin.core.errors import InputError, InterruptedRunError, check_name, check_number
@@ -33,8 +34,8 @@ from coliags_plugin.results.record import SEEN_SUFFIX, Result
 
 log = logging.getLogger(__name__)
 
-#: Names of methods, paths of method configs, and variants; or one of these.
-Methods = str | Variant | Sequence[str | Variant]
+#: Methods, names and paths of ablations, and variants; or one of these.
+Methods = Method | Variant | Sequence[Method | Variant]
 
 
 class CellJob(Job):
@@ -251,8 +252,9 @@ def _states(cells: Sequence[ComparisonCell], comparison: ComparisonFolder) -> Di
 
 def plan_cells(methods: Methods, options: CompareOptions) -> list[ComparisonCell]:
     """The cells that are asked for, after what can be checked without writing anything."""
-    methods = [methods] if isinstance(methods, (str, Variant)) else methods
-    variants = [each if isinstance(each, Variant) else Variant(method_name(each), each) for each in methods]
+    methods = [methods] if isinstance(methods, (str, Path, Mapping, Variant)) else methods
+    of_methods = [[each] if isinstance(each, Variant) else variants_of(method_text(each)) for each in methods]
+    variants = list(chain.from_iterable(of_methods))
     if not variants:
         raise InputError("no method", "at least one")
     twice = [name for name, count in Counter(variant.name for variant in variants).items() if count > 1]

@@ -11,10 +11,10 @@ from typing import Annotated, Any, TypeVar
 from pydantic import AfterValidator, Field, field_validator, model_validator
 from typing_extensions import Self
 
-from coliags_plugin.config.method_config import BENCHMARKS, is_path, method_folder
+from coliags_plugin.config.method_config import BENCHMARKS, is_path, is_text, method_files, method_folder, method_name
 from coliags_plugin.config.yaml_tree import at_origins, dump_inline, read_tree
 from coliags_plugin.core import registry
-from coliags_plugin.core.errors import InputError, did_you_mean
+from coliags_plugin.core.errors import InputError, check_name, did_you_mean
 from coliags_plugin.core.files import user_path
 from coliags_plugin.core.settings import Settings
 from coliags_plugin.phantom.settings import PhantomSettings
@@ -148,6 +148,23 @@ class AblationSettings(Settings):
         if self.base is None and without:
             raise ValueError(f"variant '{without[0]}' names no method, and there is no base")
         return self
+
+
+def variants_of(name: str) -> list[Variant]:
+    """The variants of an ablation, or a method alone; both by name, or by the path of a YAML file, or as its text.
+
+    Raises:
+        InputError: There is no such file or name, a method has the name of an ablation, or variants are not valid.
+    """
+    ablations, methods, is_ablation = shipped(ABLATIONS), method_files(), False
+    if is_path(name):
+        is_ablation = "variants" in read_tree(user_path(name)).value
+    elif not is_text(name):
+        check_name("method or ablation", name, sorted([*methods, *ablations]))
+        is_ablation = name in ablations
+        if is_ablation and name in methods:
+            raise InputError(f"'{name}' is a method and an ablation", "one of them", f"Give its file, {methods[name]}")
+    return load_ablation(name) if is_ablation else [Variant(method_name(name), name)]
 
 
 def load_ablation(name: str) -> list[Variant]:

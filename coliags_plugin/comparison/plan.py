@@ -162,6 +162,13 @@ def make_cells(
             chosen = () if split is None else (f"datamanager.split={split}",)
             overrides = (*scene.overrides, *chosen, *variant.overrides, *steps, *options.settings)
             config = _config(scene, variant.method, overrides)
+            for kind, name in config.components():
+                if registry.REGISTRIES[kind].source(name) == registry.REGISTERED:
+                    raise InputError(
+                        f"method '{variant.name}' uses '{name}' of {kind}, which this process registered",
+                        "components that worker processes find",
+                        f"Set {registry.PLUGIN_PATH_VARIABLE} to a file that defines COMPONENTS (docs/configs.md 7)",
+                    )
             usual, used = (_split(each) for each in (_config(scene, variant.method, scene.overrides), config))
             label = scene.name if used in (None, usual) else f"{scene.name}-{used}"
             reader = config.datamanager

@@ -2,17 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+import os
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, ValidationInfo, field_validator, model_validator
 from typing_extensions import Self
 
-from coliags_plugin.config.yaml_tree import Node, at_origins, dump, dump_inline, merge, override_all, read_tree
+from coliags_plugin.config.reference import meanings, plain_doc
+from coliags_plugin.config.yaml_tree import (
+    Node,
+    at_origins,
+    deep_merge,
+    dump,
+    dump_inline,
+    merge,
+    nodes,
+    override_all,
+    parse_value,
+    plain_value,
+    read_tree,
+)
 from coliags_plugin.core import registry
 from coliags_plugin.core.components import (
     Component,
@@ -23,12 +37,13 @@ from coliags_plugin.core.components import (
     RendererNode,
     SamplerNode,
     StrategyNode,
+    components_of,
     make_component,
 )
 from coliags_plugin.core.errors import InputError, did_you_mean
 from coliags_plugin.core.files import user_path
 from coliags_plugin.core.intrinsics import NEAR_PLANE
-from coliags_plugin.core.settings import Settings, refuse_zero_ends
+from coliags_plugin.core.settings import Rates, Settings, refuse_zero_ends
 
 #: A share of the run, strictly between its start and its end.
 Share = Annotated[float, Field(gt=0, lt=1)]
@@ -40,8 +55,8 @@ class OptimizerSettings(Settings):
     A constant rate of 0 freezes the group; one that falls needs both ends above 0. ``halve_at`` halves either.
     """
 
-    lr: float = Field(ge=0)  # at the first step
-    final_lr: float | None = Field(default=None, ge=0)  # at the last step; None: as at the first
+    lr: float = Field(ge=0)  # learning rate of Adam, at the first step
+    final_lr: float | None = Field(default=None, ge=0)  # learning rate at the last step; null: as at the first
     times_extent: bool = False  # multiply both rates by the scene's extent (docs/methods.md 2.1)
     halve_at: tuple[Share, ...] = ()  # shares of the run, between 0 and 1, after each of which the rate is halved
     beta2: float = Field(default=0.999, ge=0, lt=1)  # Adam's decay of mean squared gradients: over 1/(1 - beta2) steps
@@ -62,6 +77,12 @@ class ScheduleSettings(Settings):
     checkpoint_every: int = Field(default=5_000, ge=1)  # steps between checkpoints; the last step has one, too
 
 
+def default_rates(field: Component | None, modules: Mapping[str, Component]) -> Rates:
+    """Learning rates that the components declare, by parameter group: a module's as ``<module>.<group>``."""
+    of_modules = {f"{name}.{group}": rate for name, node in modules.items() for group, rate in node.rates.items()}
+    return {**({} if field is None else field.rates), **of_modules}
+
+
 #: Parts of a method that are one component, and its kind.
 _SECTIONS = {"datamanager": "datamanagers", "field": "fields", "renderer": "renderers", "strategy": "strategies"}
 
@@ -79,9 +100,15 @@ class MethodConfig(Settings):
     sampler: SamplerNode = Field(default="frames", validate_default=True)  # what each step looks at
     strategy: StrategyNode  # grows and prunes
     losses: dict[str, LossNode] = Field(min_length=1)  # terms by a key of your choice
-    optimizers: dict[str, OptimizerSettings]  # rates by parameter group, of all of them
+    # Adam by parameter group: a component's default rates, in which these are merged
+    optimizers: dict[str, OptimizerSettings] = Field(default_factory=dict, validate_default=True)
     schedule: ScheduleSettings = ScheduleSettings()  # how long to train and how often to write
     protocol: str = "paper"  # evaluation protocol
+
+    @field_validator("optimizers", mode="before")
+    @classmethod
+    def _over_defaults(cls, groups: object, info: ValidationInfo) -> object:
+        return deep_merge(default_rates(info.data.get("field"), info.data.get("modules", {})), groups)
 
     @field_validator("losses", "optimizers", "modules", mode="before")
     @classmethod
@@ -114,6 +141,10 @@ class MethodConfig(Settings):
                     return f"Did you mean '{section}.{key}'?"
         return super()._meant(key, data)
 
+    def components(self) -> set[tuple[str, str]]:
+        """Kind and name of all components, those among the options of others and the protocol included."""
+        return {(each.kind, each.name) for each in components_of(self)} | {("protocols", self.protocol)}
+
     def to_yaml(self) -> str:
         """The whole config, defaults included; itself a valid method config."""
         return dump(self.model_dump())
@@ -127,13 +158,38 @@ class LoadedMethod:
     config: MethodConfig
     tree: Node
 
-    def with_origins(self) -> str:
-        """The resolved config as YAML, each value followed by where it comes from."""
-        return "\n".join(_annotated(self.config.model_dump(), self.tree, 0)) + "\n"
+    def annotated(self) -> str:
+        """The resolved config as YAML, each value with where it comes from and what it means."""
+        return "\n".join(_annotated(self.config, self.tree, "")) + "\n"
+
+
+#: Name of a method, path of its file, or a mapping like that.
+Method = str | Path | Mapping[str, Any]
+#: Origin of the values of a method that is a mapping, and its name where it has none.
+MAPPING = "mapping"
+
+
+def method_text(method: Method) -> str:
+    """A method as options hold it: its name, the path of its file, or of a mapping, YAML in one line.
+
+    A mapping may hold its ``name`` beside what a file holds; a relative path of its base is one here. InputError if it
+    is none of these, or the mapping holds something that YAML does not.
+    """
+    if isinstance(method, (str, Path)):
+        return str(method)
+    if not isinstance(method, Mapping):
+        raise InputError(f"method {method!r}", 'a name, the path of a YAML file, or a mapping, {"base": "coliags"}')
+    base = str(method.get("base"))
+    return dump_inline(plain_value({**method, "base": user_path(base).resolve()} if is_path(base) else method, MAPPING))
+
+
+def is_text(method: str) -> bool:
+    """True for what :func:`method_text` makes of a mapping, not a name or path."""
+    return method.startswith("{")
 
 
 def load_method(method: str, overrides: Iterable[str] = (), data_format: str | None = None) -> LoadedMethod:
-    """Resolve a method config by its name (``coliags``, ``ablations/imia``), or the path of a YAML file.
+    """Resolve a method config by its name (``coliags``, ``ablations/imia``), the path of a YAML file, or its text.
 
     ``key.path=value`` overrides are applied last. A data format is the name of a data manager that takes the place of
     the method's, with all its options.
@@ -155,20 +211,24 @@ def _with_data_format(tree: Node, data_format: str) -> Node:
 
 
 def method_name(method: str) -> str:
-    """Name of a method, or of its file without the suffix."""
+    """Name of a method, of its file without the suffix, or within its text."""
+    if is_text(method):
+        return str(nodes(parse_value(method), MAPPING).value.get("name", Node(MAPPING, "")).value)
     return Path(method).stem if is_path(method) else method
 
 
 def method_tree(method: str, overrides: Iterable[str] = ()) -> Node:
     """Merged config tree of a method with overrides applied, before validation, each value with its origin."""
-    return override_all(_resolve(_find(method, Path.cwd()), ()), overrides)
+    return override_all(_resolve(method, Path.cwd(), ()), overrides)
 
 
-def _find(method: str, folder: Path) -> Path:
+def _find(method: str, folder: Path, descendants: tuple[Path, ...]) -> Path:
     if is_path(method):
-        path = folder / user_path(method)
+        path = Path(os.path.abspath(folder / user_path(method)))
         if not path.is_file():
-            raise InputError(f"no file {path}", "a method config", "See `coliags list methods`")
+            known = [file.name for file in path.parent.glob("*.y*ml") if file not in descendants] + [*method_files()]
+            hint = did_you_mean(path.name, known) or "See `coliags list methods`"
+            raise InputError(f"no file {path}", "a method config, or the name of a method without suffix", hint)
         return path
     files = method_files()
     if method not in files:
@@ -180,34 +240,49 @@ def _find(method: str, folder: Path) -> Path:
     return files[method]
 
 
-def _resolve(path: Path, descendants: tuple[Path, ...]) -> Node:
-    if path in descendants:
-        chain = " -> ".join(p.name for p in (*descendants, path))
-        raise InputError(f"method configs inherit from each other: {chain}", "a chain of bases that ends")
-    tree = read_tree(path)
+def _resolve(method: str, folder: Path, descendants: tuple[Path, ...]) -> Node:
+    if is_text(method):
+        tree = nodes(parse_value(method), MAPPING)
+        tree.value.pop("name", None)
+    else:
+        path = _find(method, folder, descendants)
+        if path in descendants:
+            chain = " -> ".join(p.name for p in (*descendants, path))
+            raise InputError(f"method configs inherit from each other: {chain}", "a chain of bases that ends")
+        tree, folder, descendants = read_tree(path), path.parent, (*descendants, path)
     base = tree.value.get("base")
     if base is None:
         return tree
     if not isinstance(base.value, str):
-        raise InputError(f"{base.origin}: base is {base.value!r}", "the name or path of a method config")
-    parent = _resolve(_find(base.value, path.parent), (*descendants, path))
+        raise InputError(f"{base.origin}: base is {base.plain()!r}", "the name or path of a method config")
+    try:
+        parent = _resolve(base.value, folder, descendants)
+    except InputError as error:
+        raise InputError(f"{base.origin}: base: {error.seen}", error.expected, error.do) from error
     inherited = {key: node for key, node in parent.value.items() if key != "description"}
     overriding = {key: node for key, node in tree.value.items() if key != "base"}
     return merge(Node(inherited, parent.origin), Node(overriding, tree.origin))
 
 
-def _annotated(plain: Any, tree: Node, depth: int) -> Sequence[str]:
-    lines: list[str] = []
-    for key, value in plain.items():
-        node = tree.value.get(key) if tree.is_mapping else None
-        indent = "  " * depth
-        if isinstance(value, dict) and value:
-            lines.append(f"{indent}{key}:")
-            lines.extend(_annotated(value, node or Node({}, ""), depth + 1))
+def _annotated(part: Component | Settings | Mapping[str, Any], node: Node, indent: str) -> Iterator[str]:
+    for key, value, meaning in _entries(part):
+        child = node.value.get(key) if node.is_mapping else None
+        if isinstance(value, (Component, Settings)) or (isinstance(value, dict) and value):
+            yield f"{indent}{key}:" + (f"  # {meaning}" if meaning else "")
+            bare = {} if child is None else {"name": child}
+            yield from _annotated(value, child if child and child.is_mapping else Node(bare, ""), f"{indent}  ")
         else:
-            origin = node.origin if node is not None else "default"
-            lines.append(f"{indent}{key}: {dump_inline(value)}  # {origin}")
-    return lines
+            origin = "default" if child is None else child.origin
+            yield f"{indent}{key}: {dump_inline(value)}  # {': '.join(filter(None, (origin, meaning)))}"
+
+
+def _entries(part: Component | Settings | Mapping[str, Any]) -> Iterator[tuple[str, Any, str]]:
+    """Key, value and meaning of everything in a part of a config."""
+    if isinstance(part, Component):
+        yield "name", part.name, plain_doc(part.target, "\n")
+        part = part.settings
+    told = {} if isinstance(part, Mapping) else meanings(type(part))
+    yield from ((key, value, told.get(key, "")) for key, value in (part.items() if isinstance(part, Mapping) else part))
 
 
 #: Entry points whose name is a method's, and whose value is the package that holds ``<name>.yaml``.

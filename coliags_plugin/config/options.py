@@ -30,18 +30,7 @@ OptionalInt = Annotated[int | None, _flag("INT")]
 OptionalFloat = Annotated[float | None, _flag("MM")]
 #: What is done by default, and left out by the flag ``--no-NAME``, which its help describes.
 DoneByDefault = Annotated[bool, _flag()]
-#: Texts separated by commas.
-Names = Annotated[
-    tuple[str, ...],
-    tyro.constructors.PrimitiveConstructorSpec(
-        nargs=1,
-        metavar="TEXT",
-        instance_from_str=lambda texts: tuple(filter(None, (part.strip() for part in texts[0].split(",")))),
-        is_instance=lambda value: isinstance(value, tuple),
-        str_from_instance=lambda names: [",".join(names)],
-    ),
-    _flag("TEXT"),
-]
+Names = Annotated[tuple[str, ...], _flag("NAME...")]
 
 #: ``--output`` or ``-o``: the one spelling of where a command writes.
 Output = Annotated[Path, tyro.conf.arg(aliases=("-o",), metavar="PATH")]
@@ -49,11 +38,12 @@ OptionalOutput = Annotated[Path | None, _flag("PATH", aliases=("-o",))]
 #: ``--set key=value``, repeatable; in Python a mapping.
 Assignments = Annotated[tuple[str, ...], tyro.conf.arg(name="set", metavar="KEY=VALUE"), tyro.conf.UseAppendAction]
 
-RunFolder = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(help="Run folder.")]
+Method = Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="METHOD")]
+RunFolder = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN", help="Run folder.")]
 SceneFolder = Annotated[Path, tyro.conf.arg(help="The scene's folder.")]
 _FORMAT_HELP = "Dataset format (`coliags list datamanagers`); default: recognised from the files."
 #: Name of a data manager; None: recognised from the files.
-DataFormat = Annotated[str | None, _flag("NAME", name="format", help=_FORMAT_HELP)]
+DataFormat = Annotated[str | None, _flag("NAME", help=_FORMAT_HELP)]
 MovedData = Annotated[Path | None, _flag("PATH", help="The scene's folder, where it has moved since training.")]
 Device = Annotated[
     str, tyro.conf.arg(metavar="auto|cpu|cuda|cuda:N", help="Device to compute on; cuda is the first CUDA device.")
@@ -99,6 +89,10 @@ class Options:
         for name, value in vars(self).items():
             if types[name] in (Path, Path | None) and isinstance(value, (str, Path)):
                 object.__setattr__(self, name, user_path(value))
+            elif name == "method" and not isinstance(value, (str, type(None))):
+                from coliags_plugin.config.method_config import method_text  # which needs NumPy
+
+                object.__setattr__(self, name, method_text(value))
             elif name == "settings" and not isinstance(value, tuple):
                 object.__setattr__(self, name, assignments(value))
             elif get_origin(types[name]) is tuple and not isinstance(value, tuple):
@@ -110,25 +104,25 @@ class TrainOptions(Options):
     """Options of training a method on a scene.
 
     Args:
-        method: Name of a method (`coliags list methods`) or path of a YAML file.
+        method: Name of a method (`coliags list methods`) or path of a YAML file; in Python also a mapping like one.
         output: Run folder; default runs/SCENE/METHOD/STAMP.
         steps: Training steps; schedules are scaled to them. A resumed run keeps its own unless given.
         seed: Seed of all random generators; default 0, for a resumed run its own.
         renderer: Renderer by name (`coliags list renderers`); default: the method's.
         resume: Continue from the run's latest checkpoint (without an output: the newest run of this method on this
             scene).
-        loggers: Also log to tensorboard or wandb, into the run folder (extra `loggers`), repeatable.
+        loggers: Also log to tensorboard or wandb, into the run folder (extra `loggers`).
         settings: Change a value of the method config, for instance field.voxel_size=1.0.
     """
 
-    method: tyro.conf.Positional[str]
+    method: Method
     data: SceneFolder
     output: OptionalOutput = None
     steps: OptionalInt = None
     seed: OptionalInt = None
     renderer: OptionalText = None
     resume: bool = False
-    loggers: Annotated[tuple[str, ...], tyro.conf.arg(name="logger", metavar="NAME"), tyro.conf.UseAppendAction] = ()
+    loggers: Names = ()
     settings: Assignments = ()
     data_format: DataFormat = None
     overwrite: Overwrite = False
@@ -181,24 +175,24 @@ class RenderOptions(Options):
 
     Args:
         output: Folder to create; default RUN/renders, in another light RUN/relit, along a path RUN/path.
-        frames: Which frames: train, all, or the name of a test set.
+        frames: Sets of frames: train, all, or test sets by name (default: test); or single frames by name, no video.
         along: Render only a video along this camera path, a file saved in `coliags view`.
         video: Also write trajectory.mp4, rgb beside depth.
         fps: Frames per second of the video.
         depth_kind: Which depth: sum w z, the paper's; the same divided by alpha; or that of the Gaussian at which half
             of the light is absorbed. Pictures are hatched where alpha is below 0.5.
         depth_tiff: Also write depth as float32 TIFF, scene units: depth_tiff/.
-        channels: Also write a feature channel of the method's Gaussians, for instance albedo.
+        channels: Also write feature channels of the method's Gaussians, for instance albedo.
     """
 
     output: OptionalOutput = None
-    frames: str = "test"
+    frames: Names = ("test",)
     along: Annotated[OptionalPath, tyro.conf.arg(name="path")] = None
     video: Annotated[bool, _flag(help="Do not write trajectory.mp4, rgb beside depth.")] = True
     fps: float = 15.0
     depth_kind: Literal["accumulated", "expected", "median"] = "expected"
     depth_tiff: bool = False
-    channels: Annotated[tuple[str, ...], tyro.conf.arg(name="channel", metavar="NAME"), tyro.conf.UseAppendAction] = ()
+    channels: Names = ()
     overwrite: Overwrite = False
 
 
@@ -323,9 +317,9 @@ class CompareOptions(Options):
     seeds: int = 1
     protocol: str = "paper"
     steps: OptionalInt = None
-    splits: Annotated[tuple[str, ...], tyro.conf.arg(metavar="SPLIT...")] = ()
+    splits: Names = ()
     reference: OptionalText = None
-    primary: Annotated[tuple[str, ...], tyro.conf.arg(metavar="METRIC...")] = ()
+    primary: Names = ()
     jobs: OptionalInt = None
     threads: OptionalInt = None
     executor: Annotated[str, tyro.conf.arg(metavar="local|ray")] = "local"
@@ -337,30 +331,23 @@ class CompareOptions(Options):
 
 
 @dataclass(frozen=True)
-class AblateOptions(CompareOptions):
-    """Options of an ablation: as of a comparison, with ``ablation`` as the default output folder."""
-
-    output: Output = Path("ablation")
-
-
-@dataclass(frozen=True)
 class ReportOptions(Options):
     """Options of a report.
 
     Args:
         output: File to write; with several formats, its suffix is replaced by that of each; default: report.html, .md,
             ...
-        methods: Names of methods to show, in this order, separated by commas; default: all. Tests count the others too.
-        columns: Metrics to show, separated by commas, or `all`; default: psnr,psnr_gain_fitted,ssim,lpips,depth_mse,
-            depth_mse_inner,depth_median_error.
+        methods: Methods to show, in this order; default: all. Tests count the others too.
+        columns: Metrics to show, or all; default: psnr psnr_gain_fitted ssim lpips depth_mse depth_mse_inner
+            depth_median_error.
         reference: Method that the others are compared with; default: coliags, or the best where it is not there.
         protocol: Evaluation protocol to read; NAME-truth: evaluations by `coliags eval RUN --truth SCENE`.
         frames: Held-out frames to show per scene and test set; the worst ones are added.
         title: Heading; default: methods and scenes.
         note: A remark shown at the top.
         scene: Run folder whose scene the HTML page lets its reader fly through, offline; needs the extra `viewer`.
-        formats: What to write, repeatable: html (default), markdown, latex (booktabs), csv (every frame), json
-            (tables), all.
+        formats: Files to write: html, markdown, latex (booktabs), csv (every frame), json (tables) or all of them;
+            text: print the tables.
     """
 
     output: OptionalOutput = None
@@ -368,15 +355,88 @@ class ReportOptions(Options):
     columns: Names = ()
     reference: OptionalText = None
     protocol: str = "paper"
-    frames: int = 4
+    frames: int = 2
     title: OptionalText = None
     note: OptionalText = None
     scene: OptionalPath = None
     formats: Annotated[
-        tuple[Literal["html", "markdown", "latex", "csv", "json", "all"], ...],
-        tyro.conf.arg(name="format"),
-        tyro.conf.UseAppendAction,
-    ] = ()
+        tuple[Literal["html", "markdown", "latex", "csv", "json", "all", "text"], ...], tyro.conf.arg(name="format")
+    ] = ("html",)
+    overwrite: Overwrite = False
+
+
+@dataclass(frozen=True)
+class CheckDataOptions(Options):
+    """Options of checking a scene.
+
+    Args:
+        scene: The scene's folder.
+        html: Also write an HTML page with images and the trajectory.
+        settings: An option of the data manager, for instance split=block.
+    """
+
+    scene: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SCENE")]
+    html: OptionalPath = None
+    settings: Assignments = ()
+    data_format: DataFormat = None
+
+
+@dataclass(frozen=True)
+class DepthOptions(Options):
+    """Options of estimating the depth of a scene.
+
+    Args:
+        scene: The scene's folder. Depth that it has is ignored.
+        output: Folder to create, in nerfstudio's layout.
+        prior: Folder of depth maps by image name (16-bit .png, .tiff, .npy, .exr), any unit, in place of brightness.
+        near: Nearest depth, in the scene's unit of length, with the farthest; default: found from features.
+        far: Farthest depth.
+        jobs: Number of threads; default: one for each core.
+        settings: Option of the data manager, as width=675, or of estimation, as depth.agreement=0.01 (docs/depth.md).
+    """
+
+    scene: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SCENE")]
+    output: Output
+    prior: OptionalPath = None
+    near: Annotated[float | None, _flag("LENGTH")] = None
+    far: Annotated[float | None, _flag("LENGTH")] = None
+    jobs: OptionalInt = None
+    settings: Assignments = ()
+    data_format: DataFormat = None
+    overwrite: Overwrite = False
+
+
+@dataclass(frozen=True)
+class PosesOptions(Options):
+    """Options of estimating the poses of a video.
+
+    Args:
+        frames: Video, folder of one with its calibration, or folder of images ordered by the numbers in their names.
+        output: Folder to create, in COLMAP's layout.
+        camera: A known camera, scaled to the images (c3vd: whole frames of C3VD; c3vd-undistorted; NAME.xml: of a
+            calibration file), or a camera model of COLMAP, for instance PINHOLE or OPENCV_FISHEYE; default: of the
+            calibration file in the folder, else the better of SIMPLE_RADIAL_FISHEYE and SIMPLE_RADIAL.
+        params: Parameters of COLMAP's model, pixel centres at integers + 0.5, kept fixed; default: estimated.
+        diameter: The colon's typical inner diameter, which fixes the scale roughly; default: the scale stays unknown.
+        distance: Names of two images and the known distance between their cameras, which fixes the scale.
+        mask: Mask image, black where pixels are ignored, or a folder with one per image; default: black surroundings
+            and overlays are found, of images of one size.
+        every: Use every n-th image.
+        max_frames: Use at most the first n images.
+        settings: An option of matching or mapping, for instance exhaustive_up_to=80 or features.max_features=2000.
+    """
+
+    frames: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FRAMES")]
+    output: Output
+    camera: OptionalText = None
+    params: Annotated[OptionalText, tyro.conf.arg(metavar="P1,P2,...")] = None
+    diameter: OptionalFloat = None
+    distance: Annotated[tuple[str, str, float] | None, _flag("IMAGE IMAGE MM")] = None
+    mask: OptionalPath = None
+    every: int = 1
+    max_frames: OptionalInt = None
+    settings: Assignments = ()
+    overwrite: Overwrite = False
 
 
 @dataclass(frozen=True)

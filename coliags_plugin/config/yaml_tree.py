@@ -114,7 +114,10 @@ def parse_value(text: str) -> object:
 def _convert(loader: _Loader, node: yaml.Node, source: str) -> Node:
     origin = f"{source}:{node.start_mark.line + 1}"
     if not isinstance(node, yaml.MappingNode):
-        return Node(tuples(loader.construct_object(node, deep=True)), origin)
+        try:
+            return Node(tuples(loader.construct_object(node, deep=True)), origin)
+        except ValueError as error:  # of a date or number
+            raise InputError(f"{origin}: {error}", "valid YAML") from error
     children: dict[str, Node] = {}
     for key_node, value_node in node.value:
         key = str(loader.construct_object(key_node))
@@ -163,17 +166,17 @@ def parse_assignment(assignment: str) -> Node:
     if not equals or ".".join(keys) != path.strip():
         raise InputError(f"setting '{assignment}'", "key.path=value, for instance field.geometry_head.frequencies=8")
     origin = f"`{assignment}`"
-    node = _nodes(parse_value(text), origin)
+    node = nodes(parse_value(text), origin)
     for key in reversed(keys):
         node = Node({key.strip('"'): node}, origin)
     return node
 
 
-def _nodes(value: object, origin: str) -> Node:
+def nodes(value: object, origin: str) -> Node:
     """A plain value as a tree of nodes, all of one origin."""
     if not isinstance(value, dict):
         return Node(value, origin)
-    return Node({str(key): _nodes(child, origin) for key, child in value.items()}, origin)
+    return Node({str(key): nodes(child, origin) for key, child in value.items()}, origin)
 
 
 def override_all(tree: Node, assignments: Iterable[str]) -> Node:
@@ -232,19 +235,19 @@ def assignments(settings: Mapping[str, object] | None) -> tuple[str, ...]:
         return ()
     if not isinstance(settings, Mapping) or not all(isinstance(key, str) for key in settings):
         raise InputError(f"settings {settings!r}", 'values by key path, for instance {"schedule.steps": 5000}')
-    return tuple(f"{key}={dump_inline(_plain(value, key))}" for key, value in settings.items())
+    return tuple(f"{key}={dump_inline(plain_value(value, key))}" for key, value in settings.items())
 
 
-def _plain(value: object, key: str) -> object:
-    """Value of a node as plain lists, mappings and scalars."""
+def plain_value(value: object, key: str) -> object:
+    """Value of a node as plain lists, mappings and scalars; the key is for errors."""
     if hasattr(value, "item") and getattr(value, "ndim", None) == 0:
         value = value.item()  # a number of NumPy
     if isinstance(value, Path):
         return str(value)
     if isinstance(value, Mapping):
-        return {str(name): _plain(child, f"{key}.{name}") for name, child in value.items()}
+        return {str(name): plain_value(child, f"{key}.{name}") for name, child in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_plain(child, key) for child in value]
+        return [plain_value(child, key) for child in value]
     if value is None or isinstance(value, (bool, int, float, str)):
         return value
     raise InputError(

@@ -21,7 +21,7 @@ from coliags_plugin.contracts.rendering import ViewModule
 from coliags_plugin.contracts.schedule import Schedule, log_linear
 from coliags_plugin.core.json_files import JsonObject
 from coliags_plugin.core.render_output import RenderOutput
-from coliags_plugin.core.scenes import Target
+from coliags_plugin.core.scenes import Target, View
 from coliags_plugin.core.settings import Configurable, Settings, SettingsT, refuse_zero_ends
 
 
@@ -35,6 +35,7 @@ class TrainingStep:
         model: The field, and the modules by name.
         step: Counted from 1.
         schedule: Of the run.
+        views: Rendered views, each as rendered and as shaded by each view module in turn.
     """
 
     output: RenderOutput
@@ -42,6 +43,7 @@ class TrainingStep:
     model: TrainedModel
     step: int
     schedule: Schedule
+    views: Sequence[tuple[View, Sequence[RenderOutput]]] = ()
 
 
 class TrainedModel(TypingProtocol):
@@ -172,7 +174,7 @@ class LossSettings(Settings):
     final_weight: float | None = None  # factor at the last step, approached log-linearly; null: constant weight
     min_weight: float = Option(default=0.0, ge=0.0)  # lower bound of the decaying weight
     from_step: int = Option(default=0, ge=0)  # the term is active after this step
-    until_step: int | None = Option(default=None, ge=1)  # and up to this one; null: to the end
+    until_step: int | None = Option(default=None, ge=1)  # the term is active up to this step; null: to the end
 
     @model_validator(mode="after")
     def _ends_above_zero(self) -> Self:
@@ -235,11 +237,15 @@ class Loss(ABC, Configurable[LossSettingsT]):
         """The unweighted term; pixels whose ``step.target.mask`` is False are ignored."""
 
 
+class StopTraining(Exception):
+    """Raised by a follower: training ends after this step, whose state is saved; the message is the reason."""
+
+
 class Follower:
-    """Observer of a training run, called after every step and every row of the log; it changes nothing of the run."""
+    """Observer of a training run, which it does not change; one that fails is left out from then on, with a warning."""
 
     def logged(self, row: JsonObject) -> None:
-        """A row has been added to the training log (docs/results_files.md)."""
+        """A row has been added to the training log: ``step``, ``loss``, ``terms``, ``psnr`` (dB), ``seconds`` ..."""
 
     def stepped(self, step: int) -> None:
         """A training step is done; the model stays as it is until this returns."""

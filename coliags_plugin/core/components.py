@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import Annotated, Any
@@ -12,7 +12,7 @@ from pydantic_core import PydanticCustomError
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.registry import REGISTRIES, Resolver
-from coliags_plugin.core.settings import Settings, invalid_reported
+from coliags_plugin.core.settings import Rates, Settings, invalid_reported
 
 
 @dataclass(frozen=True)
@@ -27,6 +27,21 @@ class Component:
     def target(self) -> Any:
         """The registered class."""
         return REGISTRIES[self.kind].get(self.name)
+
+    @property
+    def rates(self) -> Rates:
+        """Default learning rates by parameter group, with those of the components among its options."""
+        parts = (self, *components_of(self.settings))
+        return {group: rates for part in parts for group, rates in part.target.rates.items()}
+
+
+def components_of(settings: Settings) -> Iterator[Component]:
+    """The components among some options, each followed by those among its own options."""
+    for value in vars(settings).values():
+        for each in value.values() if isinstance(value, dict) else [value]:
+            if isinstance(each, Component):
+                yield each
+                yield from components_of(each.settings)
 
 
 def make_component(kind: str, node: object) -> Component:

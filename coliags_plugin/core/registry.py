@@ -3,23 +3,28 @@
 One :class:`Registry` per kind. Built-ins are ``"name": "module:Class"`` strings, so listing them imports
 nothing. Other packages add components through entry points in the group ``coliags_plugin.<kind>``; uninstalled
 work does so through ``COLIAGS_PLUGIN_PATH``, a path list of Python files that each define
-``COMPONENTS = {"<kind>": {"<name>": Class or "module:Class"}}``.
+``COMPONENTS = {"<kind>": {"<name>": Class or "module:Class"}}``, or by :func:`register`, in one process alone.
 """
 
 from __future__ import annotations
 
+import hashlib
 import os
+import sys
 from collections.abc import Iterator, Mapping
 from functools import cache
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from runpy import run_path
+from types import ModuleType
 from typing import Any
 
 from coliags_plugin.core.errors import InputError, check_name
 
 PLUGIN_PATH_VARIABLE = "COLIAGS_PLUGIN_PATH"
+#: Source of components that a process registers (:func:`register`).
+REGISTERED = "coliags_plugin.register"
 
 
 class Resolver:
@@ -46,16 +51,18 @@ class Registry:
         self.noun = noun
         self._targets: dict[str, object] = {}
         self._sources: dict[str, str] = {}
+        self._files: dict[str, str] = {}  # of COLIAGS_PLUGIN_PATH
         self._complete = False
         for name, target in builtins.items():
             self.register(name, target, source="built in")
 
-    def register(self, name: str, target: object, source: str = "registered") -> None:
+    def register(self, name: str, target: object, source: str = REGISTERED) -> None:
         """Add one component: a class, an object, or ``"module:Class"`` to import when first asked for.
 
-        The source is for listings and errors. InputError where the name is taken.
+        The source is for listings and errors. InputError where the name is taken, unless a class is registered again.
         """
-        if name in self._targets:
+        is_again = self._sources.get(name) == source == REGISTERED and _path(self._targets[name]) == _path(target)
+        if name in self._targets and not is_again:
             raise InputError(
                 f"{self.kind}: '{name}' from {source} is already taken by {self._sources[name]}",
                 "one component per name",
@@ -73,6 +80,16 @@ class Registry:
         """Origin of the component of this name: this package, or the plugin that registers it."""
         self._discover()
         return self._sources[name]
+
+    def origin(self, name: str) -> dict[str, str]:
+        """Class and source of a component, and its file with a hash where it has one, for the record of a run."""
+        target = self.get(name)
+        kind = target if isinstance(target, type) else type(target)
+        origin = {"class": _path(kind), "source": PLUGIN_PATH_VARIABLE if name in self._files else self._sources[name]}
+        file = self._files.get(name) or getattr(sys.modules.get(kind.__module__), "__file__", None)
+        if file is not None:
+            origin |= {"file": Path(file).name, "sha256": hashlib.sha256(Path(file).read_bytes()).hexdigest()}
+        return origin
 
     def get(self, name: str) -> Any:
         """The component of a name, imported on first use."""
@@ -100,10 +117,12 @@ class Registry:
             return
         self._complete = True
         for entry in installed(f"coliags_plugin.{self.kind}"):
-            self.register(entry.name, entry.value, source=f"entry point {entry.value}")
+            package = f" of {entry.dist.name} {entry.dist.version}" if entry.dist else ""
+            self.register(entry.name, entry.value, source=f"entry point {entry.value}{package}")
         for path, components in _plugin_files(os.environ.get(PLUGIN_PATH_VARIABLE, "")).items():
             for name, target in components.get(self.kind, {}).items():
                 self.register(name, target, source=path)
+                self._files[name] = path
 
 
 @cache
@@ -117,6 +136,11 @@ def installed(group: str) -> tuple[EntryPoint, ...]:
     return tuple(_entry_points().select(group=group))
 
 
+def _path(target: object) -> str:
+    """``module:Class`` of a class, or of the name of one."""
+    return f"{target.__module__}:{target.__qualname__}" if isinstance(target, type) else str(target)
+
+
 def _load(target: str) -> Any:
     module, _, attribute = target.partition(":")
     return getattr(import_module(module), attribute)
@@ -125,14 +149,18 @@ def _load(target: str) -> Any:
 @cache
 def _plugin_files(path_list: str) -> dict[str, dict[str, dict[str, object]]]:
     files: dict[str, dict[str, dict[str, object]]] = {}
-    for path in map(os.path.expanduser, filter(None, path_list.split(os.pathsep))):
+    for path in map(os.path.abspath, map(os.path.expanduser, filter(None, path_list.split(os.pathsep)))):
         if not Path(path).is_file():
             raise InputError(
                 f"{PLUGIN_PATH_VARIABLE} names '{path}', which is not a file",
                 "a path list of Python files",
                 f"Correct or unset {PLUGIN_PATH_VARIABLE}",
             )
-        components: Any = run_path(path).get("COMPONENTS")
+        # A module, in which annotations and the source of classes are found.
+        module = ModuleType(f"{PLUGIN_PATH_VARIABLE}.{Path(path).stem}")
+        vars(module).update(run_path(path, run_name=module.__name__))
+        sys.modules[module.__name__] = module
+        components: Any = vars(module).get("COMPONENTS")
         is_mapping = isinstance(components, dict) and components.keys() <= REGISTRIES.keys()
         if not is_mapping or not all(isinstance(named, dict) for named in components.values()):
             raise InputError(
@@ -273,3 +301,21 @@ metrics = REGISTRIES["metrics"]
 protocols = REGISTRIES["protocols"]
 pose_formats = REGISTRIES["pose_formats"]
 phantom_layouts = REGISTRIES["phantom_layouts"]
+
+
+def register(kind: str, name: str, target: object) -> None:
+    """Add a component to this process, for notebooks and scripts: ``register("losses", "edges", EdgesLoss)``.
+
+    Worker processes do not see it: for comparisons, name its file in ``COLIAGS_PLUGIN_PATH``.
+
+    Args:
+        kind: A plural noun, as ``coliags list`` prints them.
+        name: The component's name in method configs; a class that is defined again replaces itself.
+        target: A class that implements the kind's base class, or ``"module:Class"``.
+
+    Raises:
+        InputError: There is no such kind, or the name is taken by another component.
+    """
+    check_name("kind", kind, REGISTRIES)
+    REGISTRIES[kind].names()  # which its name must differ from
+    REGISTRIES[kind].register(name, target)

@@ -302,6 +302,13 @@ class PointCloud:
         return len(self.positions)
 
 
+#: What to do about a scene with poses and without dense depth, whether it has points or not.
+TO_GET_DEPTH = (
+    "`coliags depth SCENE --output SCENE-depth` estimates depth, and `coliags train coliags-plus --data SCENE-depth` "
+    "trains on it"
+)
+
+
 @dataclass(frozen=True, eq=False)
 class Scene:
     """A dataset with its split and initial points; equal to itself alone.

@@ -56,6 +56,8 @@ class Settings(BaseModel):
         return did_you_mean(key, cls.model_fields)
 
 
+#: Learning rates by parameter group: options of ``optimizers`` in method configs, the rate ``lr`` among them.
+Rates = Mapping[str, Mapping[str, Any]]
 #: Settings of a component's base class.
 SettingsT = TypeVar("SettingsT", bound=Settings, default=Any)
 
@@ -64,6 +66,8 @@ class Configurable(Generic[SettingsT]):
     """Base class of what has options: ``class EdgesLoss(Loss[EdgesSettings])`` names their class, ``Settings``."""
 
     Settings: ClassVar[type[Settings]]
+    #: Default learning rates of a component that learns.
+    rates: ClassVar[Rates] = {}
     settings: SettingsT
 
     def __init_subclass__(cls, **options: object) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import logging
-import shlex
 from abc import abstractmethod
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -35,7 +34,7 @@ from coliags_plugin.core.scene_files import (
     parallel_map,
     read_unit,
 )
-from coliags_plugin.core.scenes import Frame, PointCloud, Scene
+from coliags_plugin.core.scenes import TO_GET_DEPTH, Frame, PointCloud, Scene
 from coliags_plugin.core.settings import Settings
 from coliags_plugin.core.splits import Split, divide
 from coliags_plugin.datamanagers.fusion import DEPTH_POINTS, fuse_depth, load_points, subsampled
@@ -408,8 +407,7 @@ class RecordedDataManager(DataManager):
             raise NoPointsError(
                 f"{path} has neither depth files nor {missing}",
                 "depth or points for the initial Gaussians",
-                f"Estimate depth: coliags depth estimate {shlex.quote(str(path))} -o FOLDER; or put "
-                f"{missing} (world of the poses) there; or {from_file}",
+                f"{TO_GET_DEPTH}; or put {missing} (world of the poses) there; or {from_file}",
             )
         points = subsampled(read_points(source), settings.points_count, generator, source)
         record = PointsRecord(

@@ -28,7 +28,7 @@ def find_device(name: str) -> torch.device:
         raise InputError(f"device '{name}'", "auto, cpu, cuda or cuda:N, N being the number of a CUDA device")
     if not torch.cuda.is_available():
         problem = f"device {name} was requested, but torch finds none"
-        raise InputError(problem, "cpu, or auto", "See `coliags doctor`")
+        raise InputError(problem, "cpu, or auto", "See `coliags check installation`")
     index, count = int((cuda and cuda[1]) or 0), torch.cuda.device_count()
     if index >= count:
         there = ", ".join(f"cuda:{number} ({torch.cuda.get_device_name(number)})" for number in range(count))

@@ -8,6 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 import torch
 
 from coliags_plugin.contracts import Comparison
@@ -23,12 +24,12 @@ from coliags_plugin.engine.progress import ProgressReport
 from coliags_plugin.engine.scoring import EvaluatedSet, Scorer
 from coliags_plugin.engine.trained import TrainedRun
 from coliags_plugin.reporting.colormaps import (
-    DEPTH_ERROR_LIMIT_MM,
     color_bar,
     colorize_depth,
     colorize_error,
     depth_error,
     depth_limits,
+    error_limit,
 )
 from coliags_plugin.reporting.image_files import eight_bit, read_depth_tiff, write_depth_tiff, write_png
 from coliags_plugin.results.hashing import code_key, metrics_sha256, plain_config, result_key
@@ -81,11 +82,12 @@ def evaluate(trained: TrainedRun, protocol_name: str, other: Scene | None = None
                 comparison = scorer.protocol.compare(output, placed)
                 refined = scorer.refined(trained.model, placed) if refine_poses else ()
                 evaluated[set_name].add(placed, comparison, output.alpha, *refined)
-                _write_images(scratch, set_name, frame, comparison, DEPTH_ERROR_LIMIT_MM / scale)
+                _write_images(scratch, set_name, frame, comparison)
                 if (depth := output.expected_depth) is not None:
                     write_depth_tiff(scratch / EXPECTED_DEPTH / set_name / f"{frame.name}.tiff", depth)
                 count += 1
                 progress.update(count)
+            _write_error_pictures(scratch, set_name, scene.length_unit)
         _write_depth_pictures(scratch, scene.length_unit)
         result = _result(trained, scorer, evaluated, meter, truth)
         write_result(scratch / RESULT_FILE, result)
@@ -101,7 +103,7 @@ def check_evaluable(model: Model, scene: Scene, scorer: Scorer) -> None:
         raise InputError(f"scene '{scene.name}' has no test frames", "a split that holds some out")
 
 
-def _write_images(folder: Path, set_name: str, frame: Frame, comparison: Comparison, error_limit: float) -> None:
+def _write_images(folder: Path, set_name: str, frame: Frame, comparison: Comparison) -> None:
     name = f"{set_name}/{frame.name}"
     write_png(folder / "renders" / f"{name}.png", eight_bit(comparison.rgb))
     write_png(folder / "truth" / f"{name}.png", frame.image)
@@ -110,8 +112,19 @@ def _write_images(folder: Path, set_name: str, frame: Frame, comparison: Compari
     true_depth = torch.where(comparison.depth_valid, comparison.true_depth, torch.nan)
     write_depth_tiff(folder / "depth" / f"{name}.tiff", comparison.depth)
     write_depth_tiff(folder / "true_depth" / f"{name}.tiff", true_depth)
-    error = depth_error(comparison.depth, true_depth, comparison.depth_valid)
-    write_png(folder / "errors" / f"{name}.png", colorize_error(error, error_limit))
+
+
+def _write_error_pictures(evaluation: Path, set_name: str, unit: str) -> None:
+    """Colour the errors of the depth maps of ``depth/SET/`` as ``errors/SET/``, beside their scale."""
+
+    def error(file: Path) -> np.ndarray:
+        return depth_error(read_depth_tiff(file), read_depth_tiff(evaluation / "true_depth" / set_name / file.name))
+
+    if files := sorted((evaluation / "depth" / set_name).glob("*.tiff")):
+        end = error_limit(map(error, files))
+        for file in files:
+            write_png(evaluation / "errors" / set_name / f"{file.stem}.png", colorize_error(error(file), end))
+        write_png(evaluation / "errors" / f"{set_name}_scale.png", color_bar((0.0, end), unit, "error"))
 
 
 def _write_depth_pictures(evaluation: Path, unit: str) -> None:

@@ -68,10 +68,19 @@ def held_light(name: str, model: Model, cameras: Sequence[Camera]) -> HeldLight 
 
 
 def render_held(model: Model, camera: Camera, light: HeldLight | None, wants: Sequence[str]) -> RenderOutput:
-    """Render a view of a model under a held light, or else the camera's own lamp, without view modules."""
+    """Render the view of a free camera under a held light, or else the camera's own lamp.
+
+    View modules shade it as for any free camera: with the response of the camera, and no frame's own gain.
+    """
     camera, field, renderer = model.placed(camera), gaussians_of(model), splatting_of(model)
-    scaled = None if light is None else light.scaled(model.scale)
-    return model.in_scene_units(renderer.draw(field.gaussians(camera, scaled), camera, wants))
+    modules = model.view_modules.values()
+    needed = tuple(dict.fromkeys([*wants, *(name for module in modules for name in module.wants)]))
+    output = renderer.draw(
+        field.gaussians(camera, None if light is None else light.scaled(model.scale)), camera, needed
+    )
+    for module in modules:
+        output = module.shade(output, None)
+    return model.in_scene_units(output)
 
 
 def gaussians_of(model: Model) -> GaussianField:
@@ -105,7 +114,7 @@ def relight(trained: TrainedRun, lamp: Lamp) -> TrainedRun:
 def flatten(trained: TrainedRun) -> TrainedRun:
     """The run in the same light everywhere: at the median distance and angle of what the training cameras see.
 
-    View modules are left out, so that no gain is applied; it shares the parameters.
+    No frame's own gain is applied; it shares the parameters.
     """
     splatting_of(trained.model)
     gaussians_of(trained.model)

@@ -1,4 +1,4 @@
-"""Observers of a training run, none of which can end it; loggers of the extra ``loggers``."""
+"""Followers of a training run together; loggers of the extra ``loggers``."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 from uuid import uuid4
 
 from coliags_plugin.config.yaml_tree import dump
-from coliags_plugin.contracts import Follower, Logger
+from coliags_plugin.contracts import Follower, Logger, StopTraining
 from coliags_plugin.core import registry
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.json_files import JsonObject, scalars
@@ -24,6 +24,7 @@ class Followers(Follower):
 
     def __init__(self, followers: Sequence[Follower]) -> None:
         self._followers = list(followers)
+        self.stopped = False  # whether one of them has ended training
 
     def logged(self, row: JsonObject) -> None:
         """Pass on a row of the log."""
@@ -41,9 +42,12 @@ class Followers(Follower):
         for follower in tuple(self._followers):
             try:
                 call(follower)
+            except StopTraining as reason:
+                self.stopped = True
+                log.info("%s ends training: %s", type(follower).__name__, reason)
             except Exception as error:  # whatever its library raises
                 self._followers.remove(follower)
-                log.warning("training goes on without %s: %s", type(follower).__name__, error)
+                log.warning("training goes on without %s: %r", type(follower).__name__, error)
 
 
 class TensorBoardLogger(Logger):

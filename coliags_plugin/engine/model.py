@@ -17,7 +17,7 @@ from coliags_plugin.core.intrinsics import NEAR_PLANE
 from coliags_plugin.core.json_files import JsonObject
 from coliags_plugin.core.provenance import held_out_uses
 from coliags_plugin.core.render_output import DEPTH_KINDS, RenderOutput
-from coliags_plugin.core.scenes import Scene, View
+from coliags_plugin.core.scenes import TO_GET_DEPTH, Scene, View
 from coliags_plugin.renderers.splatting import ChosenRenderer
 
 log = logging.getLogger(__name__)
@@ -222,23 +222,17 @@ def _check_data(scene: Scene, losses: Mapping[str, Loss]) -> None:
     there = {name for name in named | {"sparse_depth"} if any(getattr(f, name, None) is not None for f in scene.train)}
     for key, loss in losses.items():
         for missing in sorted(loss.needs - there):
-            instead = ""
-            if missing == "depth":
-                of_points = ", train the method coliags-plus on its points" if "sparse_depth" in there else ""
-                instead = f"{of_points}, or make a scene with depth: coliags depth estimate"
             raise InputError(
                 f"loss term '{key}' needs {_DATA.get(missing, missing)}, and no training frame of scene "
                 f"'{scene.name}' has any",
                 f"frames with {_DATA.get(missing, missing)}, or no such term",
-                f"Remove it with `losses.{key}=null`{instead}",
+                f"Remove it with `losses.{key}=null`" if missing != "depth" else TO_GET_DEPTH,
             )
-        if loss.reads_any and not loss.reads_any & there:
-            log.warning(
-                "no training frame of scene '%s' has depth, so loss term '%s' does nothing, and floaters are likely; "
-                "`coliags depth estimate` makes a scene with depth",
-                scene.name,
-                key,
-            )
+        if "depth" in loss.reads_any - there:
+            points = "sparse_depth" in loss.reads_any & there
+            does = "is of single points only" if points else "does nothing, and floaters are likely"
+            dense = "no training frame of scene '%s' has dense depth: loss term '%s' %s; %s"
+            log.warning(dense, scene.name, key, does, TO_GET_DEPTH)
 
 
 def _check_points_in_view(config: MethodConfig, scene: Scene) -> None:
@@ -256,7 +250,7 @@ def _check_points_in_view(config: MethodConfig, scene: Scene) -> None:
     raise InputError(
         f"{problem}, and nothing nearer than {near:g} is drawn",
         "lengths in mm, and poses and points of one world",
-        "`coliags data check` looks into poses, depth and units; small units on purpose need `near_plane=LENGTH`",
+        "`coliags check data` looks into poses, depth and units; small units on purpose need `near_plane=LENGTH`",
     )
 
 

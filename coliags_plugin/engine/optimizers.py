@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from difflib import get_close_matches
 
 import torch
 from torch import Tensor, nn
 
 from coliags_plugin.config.method_config import OptimizerSettings
+from coliags_plugin.config.yaml_tree import dump_inline
 from coliags_plugin.contracts import log_linear
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.registry import REGISTRIES
 from coliags_plugin.engine.model import Model
 
 #: What belongs to a row beside its value.
@@ -117,13 +120,23 @@ class Optimizers:
             }
 
 
+def _rates_like(group: str) -> str:
+    """Default rates of groups of built-in components: of those that end in the same word, or of the nearest names."""
+    kinds = [REGISTRIES[kind] for kind in ("fields", "geometry_heads", "appearance_heads", "modules")]
+    built_in = [kind.get(name) for kind in kinds for name in kind if kind.source(name) == "built in"]
+    rates = {known: values for component in built_in for known, values in component.rates.items()}
+    name = group.rpartition(".")[2]
+    alike = [known for known in rates if known.split("_")[-1] == name.split("_")[-1]]
+    return "; ".join(f"{near}: {dump_inline(rates[near])}" for near in alike or get_close_matches(name, rates, 3, 0.0))
+
+
 def _check_groups(there: set[str], named: set[str]) -> None:
     if missing := sorted(there - named):
         raise InputError(
-            f"optimizers lacks the parameter groups {', '.join(missing)}",
+            f"optimizers lacks the parameter groups {', '.join(missing)}, for which no component declares rates",
             f"rates for each of {', '.join(sorted(there))}",
-            f"Add {missing[0]}: {{lr: ...}} under optimizers of the method config, or "
-            f'`optimizers."{missing[0]}"={{lr: 0.001}}`',
+            f"Shipped methods have, by default, {_rates_like(missing[0])}. Set "
+            f'`optimizers."{missing[0]}"={{lr: ...}}`, or declare `rates` in the class (docs/configs.md 5)',
         )
     if unknown := sorted(named - there):
         raise InputError(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -15,7 +16,7 @@ from torch import Tensor
 from coliags_plugin.config.options import RenderOptions
 from coliags_plugin.config.yaml_tree import dump, tuples
 from coliags_plugin.core.cameras import Camera
-from coliags_plugin.core.errors import check_name
+from coliags_plugin.core.errors import InputError, check_name, did_you_mean
 from coliags_plugin.core.files import atomic_folder, atomic_write, write_json
 from coliags_plugin.core.json_files import read_json
 from coliags_plugin.core.render_output import OPAQUE_ALPHA, RenderOutput
@@ -25,30 +26,31 @@ from coliags_plugin.engine.held_light import render_held
 from coliags_plugin.engine.progress import ProgressReport
 from coliags_plugin.engine.trained import TrainedRun
 from coliags_plugin.reporting.colormaps import (
-    DEPTH_ERROR_LIMIT_MM,
-    RGB_ERROR_LIMIT,
     color_bar,
     colorize_depth,
     colorize_error,
     depth_error,
     depth_limits,
+    error_limit,
     rgb_error,
 )
 from coliags_plugin.reporting.image_files import eight_bit, write_depth_tiff, write_png
 from coliags_plugin.reporting.video import check_rate, write_video
 
+_View = TypeVar("_View", Frame, Camera, Frame | Camera)
 #: Outputs of a view unless others are asked for.
 _WANTS = ("rgb", "alpha", "depth_accumulated")
 
 
 def render_run(trained: TrainedRun, options: RenderOptions) -> Path:
-    """Render colour, depth and error images of a set of frames, and a video along the trajectory.
+    """Render colour, depth and error images of frames, and, unless some are named singly, a video of the trajectory.
 
     A relit run has its light in ``lamp.yaml``, and no colour errors, there being no images in that light. Depth, of one
     of the kinds of docs/conventions.md 3, is hatched where alpha is below 0.5, and has no errors where the scene's own
-    is estimated; as float32 TIFF it has scene units and all pixels. Feature channels have one or three numbers, 1 is
-    white. The video, ``trajectory.mp4``, has every frame's view in video order, rgb beside depth. With a camera path
-    to go ``along``, there are no images of frames, and the video is ``path.mp4``. Returns the folder.
+    is estimated; as float32 TIFF it has scene units and all pixels. Errors of the frames have one scale, in a picture
+    beside their folder. Feature channels have one or three numbers, 1 is white. The video, ``trajectory.mp4``, has
+    every frame's view in video order, rgb beside depth. With a camera path to go ``along``, there are no images of
+    frames, and the video is ``path.mp4``. Returns the folder.
     """
     along = None if options.along is None else CameraPath.read(options.along)
     output = options.output or trained.run.path / ("path" if along else "relit" if trained.relit else "renders")
@@ -59,31 +61,35 @@ def render_run(trained: TrainedRun, options: RenderOptions) -> Path:
     depth = f"depth_{options.depth_kind}"
     wants, unit = ("rgb", "alpha", depth), trained.scene.length_unit
     trained.model.check_outputs(wants, f"depth of kind '{options.depth_kind}'")
-    path: Sequence[Frame | Camera] = choose_frames(trained.scene, "all")
+    path: Sequence[Frame | Camera] = trained.scene.video
     if along is not None:
         path = list(along.cameras(trained.scene.train[0].camera, options.fps))
+    video = options.video and (along is not None or frame_sets(trained.scene).keys() >= {*options.frames})
     limits = sampled_depth_limits(trained, chosen or path, depth)
+    ends = _error_ends(trained, chosen, depth)
     with (
         atomic_folder(output, options.overwrite) as folder,
-        ProgressReport("render", len(chosen) + len(path) * options.video) as progress,
+        ProgressReport("render", len(chosen) + len(path) * video) as progress,
     ):
         for count, frame in enumerate(chosen, start=1):
             view = render_view(trained, frame, (*wants, *channels))
-            _write_frame(folder, frame, view, depth, limits, trained)
+            write_png(folder / "rgb" / f"{frame.name}.png", eight_bit(view.rgb))
+            write_png(folder / "depth" / f"{frame.name}.png", depth_picture(view, depth, limits))
+            for name, error in _errors(trained, frame, view, depth).items():
+                write_png(folder / name / f"{frame.name}.png", colorize_error(error, ends[name]))
             if options.depth_tiff:
                 write_depth_tiff(folder / "depth_tiff" / f"{frame.name}.tiff", view[depth])
             for channel in channels:
                 write_png(folder / channel / f"{frame.name}.png", eight_bit(_as_rgb(view[channel])))
             progress.update(count)
         write_png(folder / "depth_scale.png", color_bar(limits, unit, "depth"))
-        if (folder / "depth_error").exists():  # some frame has true depth
-            write_png(folder / "depth_error_scale.png", color_bar((0.0, error_limit_of(trained)), unit, "error"))
-        if chosen and not trained.relit:
-            write_png(folder / "rgb_error_scale.png", color_bar((0.0, RGB_ERROR_LIMIT), "of full scale", "error"))
+        for name, of in (("rgb_error", "of full scale"), ("depth_error", unit)):
+            if (folder / name).exists():  # some frame has such an error
+                write_png(folder / f"{name}_scale.png", color_bar((0.0, ends[name]), of, "error"))
         for light in (trained.lamp, trained.held):
             if light is not None:
                 atomic_write(folder / "lamp.yaml", dump(light.described))
-        if options.video:
+        if video:
             name = "trajectory.mp4" if along is None else "path.mp4"
             write_video(_film(trained, path, depth, limits, progress, len(chosen)), folder / name, options.fps)
     return output
@@ -91,21 +97,46 @@ def render_run(trained: TrainedRun, options: RenderOptions) -> Path:
 
 def sampled_depth_limits(trained: TrainedRun, views: Sequence[Frame | Camera], depth: str) -> tuple[float, float]:
     """One scale for a kind of depth of all views, from that of four of them."""
-    sample = views[:: max(1, len(views) // 4)][:4]
-    rendered = (render_view(trained, view, ("rgb", "alpha", depth)) for view in sample)
+    rendered = (render_view(trained, view, ("rgb", "alpha", depth)) for view in _sample(views))
     return depth_limits(opaque_depth(output, depth) for output in rendered)
 
 
-def error_limit_of(trained: TrainedRun) -> float:
-    """Largest depth error of the colour scale, scene units: 2 mm at the size at which the run was trained."""
-    return DEPTH_ERROR_LIMIT_MM / trained.model.scale
+def _error_ends(trained: TrainedRun, frames: Sequence[Frame], depth: str) -> dict[str, float]:
+    """Ends of the scales of errors by the names of their pictures, from the errors of four frames."""
+    wants = ("rgb", "alpha", depth)
+    sample = [_errors(trained, frame, render_view(trained, frame, wants), depth) for frame in _sample(frames)]
+    return {name: error_limit(each[name] for each in sample if name in each) for name in ("rgb_error", "depth_error")}
 
 
-def choose_frames(scene: Scene, frames: str) -> list[Frame]:
-    """Frames of a scene: ``train``, ``all`` (train and test in video order), or those of a test set by its name."""
-    groups = {"train": scene.train, **scene.test_sets, "all": scene.video}
-    check_name("set of frames", frames, [name for name, group in groups.items() if group])
-    return groups[frames]
+def _sample(views: Sequence[_View]) -> Sequence[_View]:
+    return views[:: max(1, len(views) // 4)][:4]
+
+
+def _errors(trained: TrainedRun, frame: Frame, output: RenderOutput, depth: str) -> dict[str, np.ndarray]:
+    """Absolute errors of a rendered frame by the names of their pictures; of depth, scene units."""
+    errors, valid = {}, frame.valid.cpu()
+    if not trained.relit:
+        errors["rgb_error"] = rgb_error(output.rgb.cpu(), frame.image, valid)
+    if (true := frame.true_depth) is not None:
+        errors["depth_error"] = depth_error(output[depth].cpu(), true, valid)
+    return errors
+
+
+def frame_sets(scene: Scene) -> dict[str, list[Frame]]:
+    """Sets of frames that are not empty: ``train``, every test set, and ``all`` (train and test in video order)."""
+    sets = {"train": scene.train, **scene.test_sets, "all": scene.video}
+    return {name: frames for name, frames in sets.items() if frames}
+
+
+def choose_frames(scene: Scene, names: Sequence[str]) -> list[Frame]:
+    """Frames of a scene by names of sets (:func:`frame_sets`) or of single frames, each frame once."""
+    sets = frame_sets(scene)
+    named = {frame.name: [frame] for frames in sets.values() for frame in frames} | sets
+    for name in names:
+        if name not in named:
+            expected = f"{', '.join(sets)}, or the name of a frame such as {scene.train[0].name}"
+            raise InputError(f"scene '{scene.name}' has no frame '{name}'", expected, did_you_mean(name, named))
+    return [*{frame.name: frame for name in names for frame in named[name]}.values()]
 
 
 @torch.no_grad()
@@ -123,22 +154,6 @@ def render_view(trained: TrainedRun, of: Frame | Camera, wants: Sequence[str] = 
 def _as_rgb(channel: Tensor) -> Tensor:
     """Three equal numbers per pixel where the channel has one. [H, W, 3]"""
     return channel.reshape(*channel.shape[:2], -1).expand(-1, -1, 3)
-
-
-def _write_frame(
-    folder: Path, frame: Frame, output: RenderOutput, depth_name: str, limits: tuple[float, float], trained: TrainedRun
-) -> None:
-    name = f"{frame.name}.png"
-    depth = output[depth_name]
-    write_png(folder / "rgb" / name, eight_bit(output.rgb))
-    write_png(folder / "depth" / name, depth_picture(output, depth_name, limits))
-    valid = frame.valid.cpu()
-    if not trained.relit:
-        error = rgb_error(output.rgb.cpu(), frame.image, valid)
-        write_png(folder / "rgb_error" / name, colorize_error(error, RGB_ERROR_LIMIT))
-    if (true := frame.true_depth) is not None:
-        error = depth_error(depth.cpu(), true, valid)
-        write_png(folder / "depth_error" / name, colorize_error(error, error_limit_of(trained)))
 
 
 def depth_picture(output: RenderOutput, depth: str, limits: tuple[float, float]) -> UInt8[np.ndarray, "H W 3"]:

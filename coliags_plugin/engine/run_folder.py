@@ -22,6 +22,7 @@ from coliags_plugin.core.files import atomic_folder, atomic_write, reporting_unw
 from coliags_plugin.core.jobs import locked
 from coliags_plugin.core.json_files import JsonObject, parse_json, read_json, scalars
 from coliags_plugin.core.provenance import Provenance
+from coliags_plugin.core.registry import PLUGIN_PATH_VARIABLE, REGISTRIES
 from coliags_plugin.core.settings import validated
 from coliags_plugin.results.hashing import code_key
 from coliags_plugin.results.record import TRUTH_SUFFIX
@@ -161,7 +162,23 @@ class RunFolder:
 
     def method(self) -> LoadedMethod:
         """The run's resolved config."""
+        self.check_plugins()
         return load_method(str(self.config_file.resolve()))
+
+    def check_plugins(self) -> None:
+        """Refuse a run of which a component is missing, and tell the file or package that it came from."""
+        for component, plugin in self.provenance().get("plugins", {}).items():
+            kind, _, name = component.partition(".")
+            if name not in REGISTRIES[kind]:
+                file = f"{plugin['file']}, SHA-256 {plugin['sha256'][:8]}..." if "file" in plugin else plugin["class"]
+                is_file = plugin["source"] == PLUGIN_PATH_VARIABLE
+                raise InputError(
+                    f"{self.path} needs {REGISTRIES[kind].noun} '{name}', from {plugin['source']} ({file})",
+                    "all components that the run was trained with",
+                    f"Set {PLUGIN_PATH_VARIABLE} to the path of {plugin['file']}"
+                    if is_file
+                    else "Install or register it",
+                )
 
     def provenance(self) -> JsonObject:
         """Content of the provenance file."""
@@ -240,13 +257,14 @@ class RunFolder:
                 now.steps,
             )
 
-    def record_code(self, step: int) -> None:
-        """Write into the provenance by which code the run goes on from a step, if that is not the code before."""
+    def record_code(self, step: int, plugins: Mapping[str, JsonObject]) -> None:
+        """Write into the provenance by which code and plugins the run goes on from a step, if those were others."""
         provenance = self.provenance()
         changes = provenance.get("code_changes", [])
-        before = changes[-1]["code"] if changes else provenance.get("code")
-        if before != code_key():
-            changes = [*changes, {"at_step": step, "code": code_key()}]
+        now = {"code": code_key(), **({"plugins": plugins} if plugins else {})}
+        before = changes[-1] if changes else provenance
+        if now != {key: before[key] for key in ("code", "plugins") if key in before}:
+            changes = [*changes, {"at_step": step, **now}]
             write_json(self.provenance_file, {**provenance, "code_changes": changes})
             logger.warning("the code has changed since %s was begun; its result will have a key of its own", self.path)
 

@@ -14,10 +14,11 @@ from dataclasses import replace
 from typing import Any, Literal
 
 import torch
+from torch import Tensor
 
-from coliags_plugin.config.method_config import LoadedMethod, method_name
+from coliags_plugin.config.method_config import LoadedMethod, default_rates, method_name
 from coliags_plugin.config.options import TrainOptions
-from coliags_plugin.contracts import Draw, Field, Follower, Loss, Sampler, Schedule, Strategy, TrainingStep
+from coliags_plugin.contracts import Field, Follower, Loss, Sampler, Schedule, Strategy, TrainingStep
 from coliags_plugin.core.errors import (
     DeviceMemoryError,
     InputError,
@@ -27,8 +28,9 @@ from coliags_plugin.core.errors import (
 )
 from coliags_plugin.core.files import atomic_write
 from coliags_plugin.core.json_files import JsonObject
-from coliags_plugin.core.render_output import BLANK_ALPHA, RenderOutput, concatenate_pixels
-from coliags_plugin.core.scenes import Frame, Scene, Target, View, concatenate_targets
+from coliags_plugin.core.registry import REGISTRIES
+from coliags_plugin.core.render_output import BLANK_ALPHA, concatenate_pixels
+from coliags_plugin.core.scenes import Frame, Scene, concatenate_targets
 from coliags_plugin.core.tensors import masked_mean, sent
 from coliags_plugin.datamanagers.agreement import agreed_depth
 from coliags_plugin.engine import checkpoints
@@ -126,7 +128,7 @@ class Trainer:
         cost = None if saved is None else self._restore(saved)
         self.run.record_schedule(self.method.config, self.step, self.strategy.plan())
         if self.step < self.steps:
-            self.run.record_code(self.step)
+            self.run.record_code(self.step, self._plugins())
         self._cut_log()
         self.costs = CostMeter(self.device, cost)
         logger.info("resuming %s at step %d of %d", self.run.path, self.step, self.steps)
@@ -151,7 +153,8 @@ class Trainer:
         """Train to the last step, logging and saving on the way, or until a signal of :data:`STOPPING` comes.
 
         Besides those of the schedule, a checkpoint is written after so many seconds; of all, so many newest are kept.
-        Followers are told of every step and of rows of the log, and closed at the end.
+        Followers are told of every step and of rows of the log, and closed at the end. One that raises
+        :class:`~coliags_plugin.contracts.StopTraining` ends training after this step, whose state is saved.
         """
         schedule = self.method.config.schedule
         logger.info("%s", self.strategy.plan())
@@ -164,7 +167,7 @@ class Trainer:
             ProgressReport(f"train {self.method.name}", self.steps, self.step) as progress,
             closing(Followers(followers)) as following,
         ):
-            while self.step < self.steps:
+            while self.step < self.steps and not following.stopped:
                 try:
                     row = self.take_step()
                 except torch.OutOfMemoryError as error:
@@ -176,14 +179,15 @@ class Trainer:
                 progress.update(self.step, f"loss {row['loss']:.4f}, {row['psnr']:.2f} dB")
                 following.stepped(self.step)
                 heap.trim_if_grown()
-                stop = interrupted() or self.step == self.steps
+                is_interrupted = interrupted() and self.step < self.steps
+                stop = is_interrupted or following.stopped or self.step == self.steps
                 late = time.monotonic() - saved >= save_seconds
                 if self.step % schedule.checkpoint_every == 0 or stop or late:
                     self.save()
                     saved = time.monotonic()
                     if keep is not None:
                         checkpoints.keep_newest(self.run.checkpoints, keep)
-                if stop and self.step < self.steps:
+                if is_interrupted:
                     raise InterruptedRunError(
                         f"stopped after step {self.step} of {self.steps}, which is saved; go on with "
                         f"{self.run.resume_command(self.method.name, self.scene_path)}"
@@ -195,10 +199,8 @@ class Trainer:
         Step, loss, terms, PSNR of this view in dB, what was drawn, what the strategy did. NotFiniteError if a loss
         term, or a parameter as the step before left it, is NaN or infinite; NothingDrawnError if views stay empty.
         """
-        step = self.step + 1
-        self.model.field.before_step(step, self.schedule)
-        output, target, views = self._render(self.sampler.next())
-        training_step = TrainingStep(output, target, self.model, step, self.schedule)
+        training_step = self.render_step()
+        step, output, target = training_step.step, training_step.output, training_step.target
         active = {key: loss for key, loss in self.losses.items() if loss.settings.active(step, self.schedule)}
         terms = {key: loss(training_step) for key, loss in active.items()}
         weights = {key: loss.settings.weight_at(step, self.steps) for key, loss in active.items()}
@@ -215,14 +217,7 @@ class Trainer:
         values = dict(zip(terms, rest[: len(terms)], strict=True))
         _check_finite(dict(zip(groups, rest[len(terms) :], strict=True)), values, step, target.name)
         self._check_drawn(alpha, step)
-        if total.requires_grad:
-            torch.autograd.backward(total)
-        changes = self.strategy.after_backward(training_step, self.optimizers)
-        self.optimizers.step(step)
-        for view, stages in views:
-            for module, stage in zip(self.model.view_modules.values(), stages, strict=False):
-                module.after_step(view, stage)
-        self.step = step
+        changes = self.finish_step(training_step, total)
         drawn = None if output.splats is None else output.splats.gaussians
         return {
             "step": step,
@@ -234,10 +229,12 @@ class Trainer:
             **changes,
         }
 
-    def _render(self, draws: list[Draw]) -> tuple[RenderOutput, Target, list[tuple[View, list[RenderOutput]]]]:
-        """Rendered output and target of the drawn frames, and the stages of each (:meth:`Model.render_stages`)."""
+    def render_step(self) -> TrainingStep:
+        """Render what the sampler draws next, with the outputs of ``wants``: the first half of a step."""
+        step = self.step + 1
+        self.model.field.before_step(step, self.schedule)
         views, targets = [], []
-        for draw in draws:
+        for draw in self.sampler.next():
             frame = self.frames[draw.frame].to(self.device)
             view = frame.view(trained=True)
             pixels = None if draw.pixels is None else sent(draw.pixels, self.device)
@@ -245,7 +242,22 @@ class Trainer:
             views.append((view, self.model.render_stages(frame.camera, self.wants, view, pixels, generator)))
             targets.append(frame.target if pixels is None else frame.target_at(pixels))
         output = concatenate_pixels([stages[-1] for _, stages in views])
-        return output, concatenate_targets(targets), views
+        return TrainingStep(output, concatenate_targets(targets), self.model, step, self.schedule, views)
+
+    def finish_step(self, step: TrainingStep, loss: Tensor) -> dict[str, int]:
+        """Backpropagate the loss, grow and prune, and step the optimizers: the second half of a step.
+
+        Returns counts of what the strategy changed.
+        """
+        if loss.requires_grad:
+            torch.autograd.backward(loss)
+        changes = self.strategy.after_backward(step, self.optimizers)
+        self.optimizers.step(step.step)
+        for view, stages in step.views:
+            for module, stage in zip(self.model.view_modules.values(), stages, strict=False):
+                module.after_step(view, stage)
+        self.step = step.step
+        return changes
 
     def save(self) -> None:
         """Write a checkpoint of the current step."""
@@ -266,6 +278,7 @@ class Trainer:
             "renderer_reason": self.chosen.reason,
             "untrained_views": {name: module.untrained_views for name, module in self.model.view_modules.items()},
             **software(),
+            **({"plugins": plugins} if (plugins := self._plugins()) else {}),
             "scene": {
                 "name": scene.name,
                 "path": self.run.relative(self.scene_path),
@@ -278,6 +291,12 @@ class Trainer:
             "plan": self.strategy.plan(),
         }
 
+    def _plugins(self) -> dict[str, JsonObject]:
+        """Origins of the components of other packages and files, by ``kind.name``."""
+        used = sorted({*self.method.config.components(), ("renderers", self.chosen.name)})
+        plugins = ((kind, name) for kind, name in used if REGISTRIES[kind].source(name) != "built in")
+        return {f"{kind}.{name}": REGISTRIES[kind].origin(name) for kind, name in plugins}
+
     def _out_of_memory(self, error: torch.OutOfMemoryError) -> DeviceMemoryError:
         count, first = self.model.field.element_count, str(error).partition("\n")[0]
         at = f"step {self.step + 1}, {count:,} elements: the memory of {self.device} ran out"
@@ -289,7 +308,7 @@ class Trainer:
             raise NothingDrawnError(
                 f"nothing was drawn in the last {MAX_BLANK_VIEWS} views, until step {step}: their mean alpha is below "
                 f"{BLANK_ALPHA:g}. Checkpoints stay whole. Learning rates or weights of losses may be too large, or "
-                f"near_plane {self.method.config.near_plane:g} may lie beyond the tissue; `coliags data check` looks "
+                f"near_plane {self.method.config.near_plane:g} may lie beyond the tissue; `coliags check data` looks "
                 "into poses and units."
             )
 
@@ -305,7 +324,11 @@ class Trainer:
         return frames
 
     def _optimizers(self) -> Optimizers:
-        return Optimizers(self.model, self.method.config.optimizers, self.steps, self.scene.extent)
+        """Optimizers of the model's groups; defaults of groups that a component leaves out are not used."""
+        config, groups = self.method.config, self.model.parameter_groups()
+        unused = default_rates(config.field, config.modules).keys() - groups.keys()
+        rates = {group: each for group, each in config.optimizers.items() if group not in unused}
+        return Optimizers(self.model, rates, self.steps, self.scene.extent)
 
     def _cut_log(self) -> None:
         """Remove log rows of steps after the checkpoint, which will be repeated."""
@@ -416,6 +439,7 @@ def open_training(
         overrides, data_format = ((), None) if if_exists == "continue" else (options.overrides, options.data_format)
         name = method_name(run_name or options.method)
         folder.check_method(name)
+        folder.check_plugins()
         # The config stored in the run, even if that of this name has changed since.
         method = load_method_for(options.data, str(folder.config_file.resolve()), overrides, data_format)
         method = replace(method, name=name)

@@ -19,7 +19,7 @@ from coliags_plugin.core.gaussians import Gaussians
 from coliags_plugin.core.json_files import JsonObject
 from coliags_plugin.core.lamps import HeldLight
 from coliags_plugin.core.scenes import Scene
-from coliags_plugin.core.settings import Settings
+from coliags_plugin.core.settings import Rates, Settings
 from coliags_plugin.core.tensors import fit_kernels, fit_triton_kernels, wall_normals
 from coliags_plugin.fields.children import AnchorRows, DrawnChildren, drawn_children, fused_children, visible_anchors
 from coliags_plugin.fields.points import (
@@ -46,7 +46,7 @@ class AnchorFieldSettings(Settings):
     children: int = Option(default=10, ge=1)  # Gaussians per anchor
     # Edge of a voxel in scene units (mm); null: voxel_pixels times the size of a training pixel on the surface.
     voxel_size: float | None = Option(default=None, gt=0)
-    # Two pixels with ten children per anchor, about half of them transparent, put a Gaussian about every pixel.
+    # Edge of a voxel, pixels: 2 with ten children per anchor, half of them transparent, put a Gaussian at every pixel.
     voxel_pixels: float = Option(default=2.0, gt=0)
 
 
@@ -69,6 +69,11 @@ class AnchorField(GaussianField[AnchorFieldSettings]):
     primitive: ClassVar[str] = "gaussians3d"
     elements: ClassVar[str] = "anchors"
     row_parameters: ClassVar[tuple[str, ...]] = ("offsets", "features", "scalings")
+    rates: ClassVar[Rates] = {  # Scaffold-GS's released code
+        "offsets": {"lr": 0.01, "final_lr": 0.0001, "times_extent": True},
+        "features": {"lr": 0.0075},
+        "scalings": {"lr": 0.007},
+    }
 
     anchors: Tensor
     normals: Tensor | None

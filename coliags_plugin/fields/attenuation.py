@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import ClassVar, Literal
 
 import torch
 from jaxtyping import Float
+from pydantic import Field
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -16,7 +17,7 @@ from coliags_plugin.core.json_files import JsonObject
 from coliags_plugin.core.lamps import HeldLight
 from coliags_plugin.core.photometry import fit_light
 from coliags_plugin.core.scenes import Scene
-from coliags_plugin.core.settings import Settings
+from coliags_plugin.core.settings import Rates, Settings
 from coliags_plugin.core.shadows import MOST_LAMPS, lit_shares
 from coliags_plugin.core.tensors import fit_kernels
 
@@ -36,11 +37,11 @@ _FEWEST = 16
 class AttenuatedAppearanceSettings(Settings):
     """Options of the attenuation; the initial exponents are those of an inverse-square law at gamma 2.2."""
 
-    head: AppearanceHeadNode  # decoder of the colours that are attenuated
+    head: AppearanceHeadNode = Field(default="imia", validate_default=True)  # decoder of the colours before attenuation
     distance_exponent: float = -0.9  # initial a
     cosine_exponent: float = 0.3  # initial b where it is not fitted
     incidence_exponent: float | None = None  # initial c where it is not fitted; null: incidence does not count
-    # b, c and the lamp's offset: as above and 0, or fitted to surface points (docs/methods.md 4.8)
+    # initial b, c and the lamp's offset: as above and 0, or fitted to surface points (docs/methods.md 4.8)
     initial: Literal["given", "points"] = "given"
     # exponents for each colour, or one pair for all: red falls off slower (docs/methods.md 3.7)
     channels: Literal[1, 3] = 3
@@ -64,6 +65,11 @@ class AttenuatedAppearanceHead(AppearanceHead[AttenuatedAppearanceSettings]):
     """
 
     decoding = "networks"
+    rates: ClassVar[Rates] = {
+        "attenuation": {"lr": 0.01, "final_lr": 0.0005},
+        "lamp_offset": {"lr": 0.01, "final_lr": 0.001},  # scene units
+        "shadow": {"lr": 0.02},  # a group with ``shadows`` alone
+    }
 
     reference: Tensor
     lamps: Tensor

@@ -19,7 +19,7 @@ from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.gaussians import Gaussians, shortest_axes
 from coliags_plugin.core.lamps import HeldLight
 from coliags_plugin.core.scenes import Scene
-from coliags_plugin.core.settings import Settings
+from coliags_plugin.core.settings import Rates, Settings
 from coliags_plugin.core.tensors import fit_kernels, point_normals
 from coliags_plugin.fields import spherical_harmonics
 from coliags_plugin.fields.points import (
@@ -88,6 +88,12 @@ class ExplicitField(GaussianField[ExplicitT]):
     elements: ClassVar[str] = "gaussians"
     #: Named as in gsplat.
     row_parameters: ClassVar[tuple[str, ...]] = ("means", "scales", "quats", "opacities")
+    rates: ClassVar[Rates] = {  # 3DGS's released code
+        "means": {"lr": 0.00016, "final_lr": 0.0000016, "times_extent": True},
+        "scales": {"lr": 0.005},
+        "quats": {"lr": 0.001},
+        "opacities": {"lr": 0.025},  # since 2024; 0.05 before
+    }
     #: Buffers that the host reads at every step: they stay on the CPU.
     host_buffers: ClassVar[tuple[str, ...]] = ()
     #: Trained scales of a Gaussian.
@@ -187,6 +193,11 @@ class ExplicitGaussians(ExplicitField[ExplicitGaussiansSettings]):
     primitive: ClassVar[str] = "gaussians3d"
     row_parameters: ClassVar[tuple[str, ...]] = (*ExplicitField.row_parameters, "sh0", "shN")
     host_buffers: ClassVar[tuple[str, ...]] = ("degree",)
+    rates: ClassVar[Rates] = {
+        **ExplicitField.rates,
+        "sh0": {"lr": 0.0025},
+        "shN": {"lr": 0.000125},
+    }  # 3DGS's released code
 
     degree: Tensor
 

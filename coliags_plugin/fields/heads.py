@@ -13,7 +13,7 @@ from typing_extensions import TypeVar
 
 from coliags_plugin.contracts import AppearanceHead, GeometryHead, HeadNetworks, SeenAnchors
 from coliags_plugin.core.scenes import Scene
-from coliags_plugin.core.settings import Settings
+from coliags_plugin.core.settings import Rates, Settings
 from coliags_plugin.fields.mlp import mlp, outputs
 
 
@@ -34,6 +34,10 @@ class PlainGeometryHead(GeometryHead[GeometryT]):
 
     Settings: ClassVar[type[Settings]] = PlainGeometrySettings
     decoding = "networks"
+    rates: ClassVar[Rates] = {  # Scaffold-GS's released code
+        "opacity_mlp": {"lr": 0.002, "final_lr": 0.00002},
+        "covariance_mlp": {"lr": 0.004},
+    }
 
     def __init__(self, settings: GeometryT, features: int, children: int, generator: torch.Generator) -> None:
         super().__init__()
@@ -76,7 +80,7 @@ class IMVEGeometrySettings(PlainGeometrySettings):
 
 
 class IMVEGeometryHead(PlainGeometryHead[IMVEGeometrySettings]):
-    """Improved geometry Modelling with View Embedding: gamma(v) in place of v (paper, Eq. 7; docs/methods.md 3.4)."""
+    """Improved Geometry Modeling with View Embedding: gamma(v) in place of v (paper, Eq. 7; docs/methods.md 3.4)."""
 
     @property
     def frequencies(self) -> int:
@@ -114,6 +118,7 @@ class MLPAppearanceHead(AppearanceHead[AppearanceT]):
     #: How many of the last inputs are embedded by gamma.
     embedded: ClassVar[int] = 0
     decoding = "networks"
+    rates: ClassVar[Rates] = {"color_mlp": {"lr": 0.008, "final_lr": 0.00005}}  # Scaffold-GS's released code
 
     def __init__(self, settings: AppearanceT, features: int, children: int, generator: torch.Generator) -> None:
         super().__init__()
@@ -189,7 +194,7 @@ class IMIAAppearanceSettings(AppearanceSettings):
 
 
 class IMIAAppearanceHead(MLPAppearanceHead[IMIAAppearanceSettings]):
-    """Improved appearance Modelling with Illumination Attenuation (paper, Eq. 8; docs/methods.md 3.4).
+    """Improved Appearance Modeling with Illumination Attenuation (paper, Eq. 8; docs/methods.md 3.4).
 
     The MLP sees v, the distance d to the lamp and gamma(cos theta), the angle to the optical axis in which light
     spread and vignetting merge.

@@ -21,6 +21,7 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.gaussians import Gaussians, third_axes
 from coliags_plugin.core.lamps import HeldLight, Lamp
 from coliags_plugin.core.scenes import PointCloud, Scene
+from coliags_plugin.core.settings import Rates
 from coliags_plugin.core.tensors import sent
 from coliags_plugin.fields.explicit_gaussians import ExplicitField, ExplicitFieldSettings
 from coliags_plugin.fields.mlp import Precision, linear_layers, reduced_dtype
@@ -134,6 +135,15 @@ class LitGaussians(ExplicitField[LitGaussiansSettings]):
     row_parameters: ClassVar[tuple[str, ...]] = (*ExplicitField.row_parameters, "albedos", "roughness", "f0")
     host_buffers: ClassVar[tuple[str, ...]] = ("network_on",)
     scale_count: ClassVar[int] = 2
+    rates: ClassVar[Rates] = {  # PR-Endo's released code
+        **ExplicitField.rates,
+        "opacities": {"lr": 0.05},
+        "albedos": {"lr": 0.000705},  # 0.0025 of albedo / 0.28209
+        "roughness": {"lr": 0.002},
+        "f0": {"lr": 0.002},
+        "lamp": {"lr": 0.003},
+        "diffuse_network": {"lr": 0.0005},
+    }
 
     extent: Tensor
     network_on: Tensor

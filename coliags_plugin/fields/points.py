@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.scenes import Scene
+from coliags_plugin.core.scenes import TO_GET_DEPTH, Scene
 from coliags_plugin.core.tensors import constant
 
 #: Floor of the mean squared neighbour distance, scene units squared (docs/methods.md 2.2).
@@ -28,7 +28,7 @@ def initial_positions(scene: Scene) -> Float[Tensor, "N 3"]:
         raise InputError(
             "the scene has no initial points",
             "at least one",
-            "Give the data manager points or depth; coliags depth estimate makes depth from posed images",
+            f"Give the data manager points, or depth: {TO_GET_DEPTH}",
         )
     return scene.points.positions
 

@@ -6,6 +6,7 @@ import logging
 from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import torch
 from jaxtyping import Float
@@ -19,7 +20,7 @@ from coliags_plugin.contracts import RadianceField, RadianceLevel, RadianceSampl
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.scenes import Scene
-from coliags_plugin.core.settings import Settings
+from coliags_plugin.core.settings import Rates, Settings
 from coliags_plugin.core.tensors import sent
 from coliags_plugin.fields.mlp import Precision, cosine_embedding, first_layer, glorot_linear, reduced_dtype
 from coliags_plugin.fields.points import initial_positions, spheres_in_frustum
@@ -88,7 +89,7 @@ def surface_distances(scene: Scene) -> Float[Tensor, "2"]:
         raise InputError(
             "no training camera has an initial point in view",
             "points on the surface that the cameras see, between which and the cameras rays are sampled",
-            "Look at poses and points with `coliags data check`",
+            "Look at poses and points with `coliags check data`",
         )
     return torch.stack([NEAR_MARGIN * all_distances.min(), FAR_MARGIN * all_distances.max()])
 
@@ -226,6 +227,10 @@ class ReimNerf(_NetworkLevel, RadianceField[ReimNerfFieldSettings]):
         normalisation: Scene units to the networks' coordinates.
         bounds: Distances between which rays are sampled, scene units. [2]
     """
+
+    rates: ClassVar[Rates] = {  # released code
+        name: {"lr": 0.0005, "halve_at": (0.5, 0.75), "eps": 1e-8} for name in ("coarse", "fine")
+    }
 
     bounds: Tensor
 

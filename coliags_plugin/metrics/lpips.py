@@ -2,7 +2,7 @@
 
 Zhang et al. 2018, "The Unreasonable Effectiveness of Deep Features as a Perceptual Metric", in plain torch. The
 backbones carry torchvision's layer numbering (``vgg16``, ``alexnet`` and ``squeezenet1_1``, their ``.features``), so
-weights published for those load as they are. Only :func:`install`, of ``coliags weights lpips``, downloads.
+weights published for those load as they are. Only :func:`install`, of ``coliags weights``, downloads.
 """
 
 from __future__ import annotations
@@ -226,7 +226,7 @@ def find_weights(net: str, folder: Path | None = None) -> tuple[Path, Path]:
     if backbone is None or heads is None:
         names = {f"backbone ({BACKBONE_FILES[net]})": backbone, f"linear heads (v0.1/{net}.pth)": heads}
         missing = [name for name, file in names.items() if file is None]
-        command = "coliags weights lpips" + ("" if net in DEFAULT_NETS else f" --net {net}")
+        command = "coliags weights" + ("" if net in DEFAULT_NETS else f" --net {net}")
         # Recorded with results, which are to be the same on every machine: no folders here.
         raise UnavailableError(
             f"LPIPS {net} weights not found: {' and '.join(missing)}. To download them, run `{command}`"

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
-from typing import Literal
+from typing import ClassVar, Literal
 
 import torch
 from jaxtyping import Float, Int
@@ -18,7 +18,7 @@ from coliags_plugin.core.json_files import JsonObject
 from coliags_plugin.core.photometry import fit_light
 from coliags_plugin.core.render_output import RenderOutput
 from coliags_plugin.core.scenes import Scene, View
-from coliags_plugin.core.settings import Settings
+from coliags_plugin.core.settings import Rates, Settings
 from coliags_plugin.core.tensors import constant
 from coliags_plugin.modules.frame_rows import FrameRows
 
@@ -161,6 +161,8 @@ class FrameGain(ViewModule[FrameGainSettings]):
         rate: Share of the learning rate. []
     """
 
+    rates: ClassVar[Rates] = {"gain": {"lr": 0.03, "final_lr": 0.001}}
+
     fitted: Tensor
     rate: Tensor
 
@@ -265,6 +267,8 @@ class CameraResponse(ViewModule[ResponseSettings]):
     Attributes:
         log_slope: Logarithm of the slope of every segment. [K]
     """
+
+    rates: ClassVar[Rates] = {"slope": {"lr": 0.03, "final_lr": 0.001}}
 
     def __init__(self, settings: ResponseSettings, scene: Scene) -> None:
         super().__init__(settings, scene)

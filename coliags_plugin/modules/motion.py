@@ -16,7 +16,7 @@ from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.json_files import JsonObject
 from coliags_plugin.core.render_output import RenderOutput
 from coliags_plugin.core.scenes import Scene, View
-from coliags_plugin.core.settings import Settings
+from coliags_plugin.core.settings import Rates, Settings
 from coliags_plugin.core.tensors import bilinear, constant
 from coliags_plugin.modules.frame_rows import FrameRows
 
@@ -49,6 +49,11 @@ class PoseCorrection(ViewModule[CorrectionSettings]):
     change slowly; no pixel of theirs is used. Views beside the video take the correction of the nearest training
     camera. Free cameras stay.
     """
+
+    rates: ClassVar[Rates] = {
+        "rotation": {"lr": 0.0001, "final_lr": 0.00001},  # radians
+        "translation": {"lr": 0.003, "final_lr": 0.0003},  # scene units, at depths of about 30
+    }
 
     def __init__(self, settings: CorrectionSettings, scene: Scene) -> None:
         super().__init__(settings, scene)
@@ -120,6 +125,7 @@ class ImageWarp(ViewModule[ImageWarpSettings]):
     """
 
     whole_image: ClassVar[bool] = True
+    rates: ClassVar[Rates] = {"displacement": {"lr": 0.01, "final_lr": 0.001}}  # percent of the image's width
 
     def __init__(self, settings: ImageWarpSettings, scene: Scene) -> None:
         super().__init__(settings, scene)

@@ -69,7 +69,7 @@ class Layout(ABC):
     default_size: ClassVar[tuple[int, int]] = (338, 270)
     #: Whether the layout supports rotation views; otherwise none are rendered.
     has_rotation: ClassVar[bool] = False
-    #: Whether the layout supports initial points.
+    #: Whether the layout has initial points, in place of depth.
     has_points: ClassVar[bool] = False
 
     def lens(self, width: int, height: int) -> tuple[Lens, Bool[np.ndarray, "H W"]]:

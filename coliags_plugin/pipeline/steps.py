@@ -476,6 +476,6 @@ def report(context: StageContext) -> StageRecord:
     """Write the report of the run."""
     protocol = RunFolder(context.run).method().config.protocol
     title = f"Reconstruction of {context.source.name}"
-    options = ReportOptions(context.folder / "report.html", title=title, protocol=protocol)
+    options = ReportOptions(context.folder / "report.html", title=title, protocol=protocol, overwrite=True)
     write_report([context.run], options)
     return StageRecord("report.html", {"report.html": "views, metrics, training, provenance"})

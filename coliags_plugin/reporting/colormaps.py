@@ -1,6 +1,7 @@
 """Colour-mapped images of depth and errors, colour bars and rows of images. Arrays in, 8-bit RGB out.
 
-Depth is drawn with viridis and errors with inferno, both perceptually uniform and easy to tell apart.
+Depth is drawn with viridis and errors with inferno, both perceptually uniform and easy to tell apart. A scale of errors
+is for one set of frames, which it is stated beside.
 """
 
 from __future__ import annotations
@@ -22,12 +23,9 @@ if TYPE_CHECKING:
 
 ColorMap = Literal["depth", "error"]
 
-#: Full scale of stand-alone depth error maps, mm; the same for all, so that they are comparable.
-DEPTH_ERROR_LIMIT_MM = 2.0
-#: Full scale of RGB error maps, as a fraction of that of the colours.
-RGB_ERROR_LIMIT = 0.2
-#: Percentiles of depth between which its colours run, and pixels of a depth map that enter them.
-_DEPTH_PERCENTILES, _SAMPLED = (1.0, 99.0), 20_000
+#: Percentiles of depth between which its colours run, median errors that a scale of errors spans, and pixels of a map
+#: that enter either.
+_DEPTH_PERCENTILES, _MEDIAN_ERRORS, _SAMPLED = (1.0, 99.0), 8.0, 20_000
 #: Grey level of pixels of unknown depth.
 UNKNOWN_GREY = 128
 #: Grey levels of the hatching over error pixels without ground truth.
@@ -96,18 +94,24 @@ def depth_scale_text(limits: tuple[float, float], unit: str) -> str:
 def scale_places(
     values: Float[np.ndarray, "*S"], limits: tuple[float, float], color_map: ColorMap
 ) -> Float[np.ndarray, "*S"]:
-    """Places of values on a scale, 0 to 1: logarithmic for depth, linear for errors; clipped to the limits."""
+    """Places of values on a scale, 0 to 1, clipped to the limits: logarithmic for depth, for errors a square root.
+
+    So that the errors of a good and of a bad method can both be seen.
+    """
     low, high = limits
     values = np.clip(values, low, high)
     if color_map == "depth":
         return np.asarray(np.log(values / low) / math.log(high / low))
-    return np.asarray((values - low) / (high - low))
+    return np.asarray(np.sqrt((values - low) / (high - low)))
 
 
 def scale_ticks(limits: tuple[float, float], color_map: ColorMap) -> list[tuple[float, float]]:
     """Ticks of a scale and their places from 0 to 1: the limits, and round numbers at some distance from them."""
     low, high = limits
-    inner = log_ticks(low, high) if color_map == "depth" and high > 10.0 * low else linear_ticks(low, high)
+    if color_map == "error":
+        inner = [share * high for share in (0.05, 0.2, 0.5)]
+    else:
+        inner = log_ticks(low, high) if high > 10.0 * low else linear_ticks(low, high)
     places = scale_places(np.array(inner, np.float64), limits, color_map).tolist()
     ticks = [(tick, place) for tick, place in zip(inner, places, strict=True) if 0.1 <= place <= 0.9]
     return [(low, 0.0), *ticks, (high, 1.0)]
@@ -146,10 +150,25 @@ def rgb_error(
     return error if valid is None else np.where(as_array(valid).astype(bool), error, np.nan)
 
 
+def error_limit(errors: Iterable[Float[np.ndarray, "H W"]]) -> float:
+    """End of the scale of the error maps of a set, in their unit: eight times their median, rounded up to two digits.
+
+    Errors of zero and those that are not finite do not count.
+    """
+    samples = [error.ravel()[:: math.ceil(error.size / _SAMPLED) or 1] for error in errors]
+    pooled = np.concatenate([*samples, np.zeros(0)])
+    pooled = pooled[np.isfinite(pooled) & (pooled > 0.0)]
+    if not pooled.size:
+        return 1.0
+    end = _MEDIAN_ERRORS * float(np.median(pooled))
+    step = 10.0 ** (math.floor(math.log10(end)) - 1)
+    return math.ceil(end / step) * step
+
+
 def colorize_error(error: Float[np.ndarray, "H W"], limit: float) -> UInt8[np.ndarray, "H W 3"]:
     """Colour-mapped error of 0 to ``limit`` and more; where it is NaN, without ground truth, hatched in grey."""
     unknown = np.isnan(error)
-    image = colored(np.where(unknown, 0.0, error) / limit, "error")
+    image = colored(scale_places(np.where(unknown, 0.0, error), (0.0, limit), "error"), "error")
     image[unknown] = hatch(*error.shape)[unknown]
     return image
 

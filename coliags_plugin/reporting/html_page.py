@@ -79,6 +79,11 @@ def refuse_folder(output: Path) -> None:
         raise InputError(f"{output} is a folder", "a file", f"Write to {output / 'report.html'}")
 
 
+def pictures_folder(output: Path) -> Path:
+    """Folder of the pictures that a page has no room for."""
+    return output.with_name(f"{output.stem}_files")
+
+
 class _Writer:
     """Writer of blocks and figures by the macros that ``blocks.html`` has of their kinds; collects their pictures."""
 
@@ -107,7 +112,7 @@ class _Writer:
 def _with_pictures(text: str, pictures: dict[str, EncodedImage], output: Path | None = None, limit: int = 0) -> str:
     """A text with the addresses of its pictures: data URIs while there is room, then files beside the output."""
     room = limit - len(text.encode()) - _NOTE_ROOM
-    folder = None if output is None else output.with_name(f"{output.stem}_files")
+    folder = None if output is None else pictures_folder(output)
     beside: dict[str, str] = {}
 
     def address(match: re.Match[str]) -> str:
@@ -194,7 +199,13 @@ class Axes:
     top: ClassVar[int] = 12
     bottom: ClassVar[int] = 250
 
-    def __init__(self, series: Sequence[Series], log_y: bool = False, names: Sequence[str] | None = None) -> None:
+    def __init__(
+        self,
+        series: Sequence[Series],
+        log_y: bool = False,
+        names: Sequence[str] | None = None,
+        equal_scales: bool = False,
+    ) -> None:
         self._log_y, self._names = log_y, names
         xs, ys = zip(*(point for line in series for point in line.points(log_y) if point), strict=True)
         self._x_limits = (min(xs), max(xs)) if names is None else (-0.5, len(names) - 0.5)
@@ -208,6 +219,12 @@ class Axes:
         else:
             margin = 0.06 * (high - low) or max(abs(high), 1.0) * 0.05
             self._y_limits = low - margin, high + margin
+        if equal_scales:
+            sides = [(self._x_limits, self.right - self.left), (self._y_limits, self.bottom - self.top)]
+            unit = max((high - low) / length for (low, high), length in sides)
+            self._x_limits, self._y_limits = (
+                ((low + high - unit * length) / 2, (low + high + unit * length) / 2) for (low, high), length in sides
+            )
 
     def x(self, value: float) -> float:
         """Horizontal coordinate of a value."""

@@ -43,7 +43,6 @@ class Fact:
     value: Value  # text or number; facts whose value is empty or None are not shown
     unit: str = ""
     note: str = ""
-    wide: bool = False  # whether it takes a line of its own
 
     @property
     def text(self) -> str:
@@ -208,6 +207,7 @@ class Chart:
     y_label: str  # quantity and unit of the y axis
     title: str = ""
     log_y: bool = False  # whether the y axis is logarithmic
+    equal_scales: bool = False  # whether a unit is as long on both axes
     x_names: Sequence[str] | None = None  # for a categorical x axis: the names of x = 0, 1, ...
     markers: bool = False  # whether to draw a dot at every point
     legend: bool = False  # whether the names of the series stand below it
@@ -260,7 +260,7 @@ class Template(Block):
 
 @dataclass(frozen=True)
 class Folded(Block):
-    """Blocks behind a title that a reader unfolds; in Markdown and LaTeX, blocks under a title."""
+    """Details behind a title, which the reader of an HTML page unfolds; JSON has their tables, texts leave them out."""
 
     kind: ClassVar[str] = "folded"
     title: str

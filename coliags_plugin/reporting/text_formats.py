@@ -86,14 +86,13 @@ class _Text:
         return self._table(table, [[*map(self._heading, table.columns)], *rows], [*map(sentence, notes)])
 
     def figures(self, block: Block, level: int = 2) -> str:
-        return ""  # pictures are only on HTML pages
+        return ""  # pictures and details are only on HTML pages
 
-    template = figures
+    folded = template = figures
 
-    def section(self, block: Section | Folded, level: int = 2) -> str:
-        return self._titled(block.title, self.blocks(block.blocks, level + 1), level)
-
-    folded = section
+    def section(self, block: Section, level: int = 2) -> str:
+        body = self.blocks(block.blocks, level + 1)
+        return self._titled(block.title, body, level) if body else ""
 
     def escaped(self, text: str) -> str:
         """Words of a text, none of whose characters has a meaning of its own."""
@@ -110,7 +109,7 @@ class _Text:
         return _aligned([[fact.name, fact.text] for fact in facts], "ll")
 
     def _titled(self, title: str, body: str, level: int) -> str:
-        return f"{title}\n{body}" if body else ""
+        return f"{title}\n{body}"
 
     def _table(self, table: Table, rows: Sequence[Sequence[str]], notes: Sequence[str]) -> str:
         """A table of headings and cells as texts, with its notes."""
@@ -147,8 +146,7 @@ class _Markdown(_Text):
 
     def page(self, page: Page) -> str:
         parts = [f"# {self.escaped(page.title)}", f"> {self.escaped(page.note)}" if page.note else ""]
-        parts.append(self.facts(FactList([fact for fact in page.facts if not fact.wide])))
-        parts += [f"{fact.name}: {self.escaped(fact.text)}" for fact in page.facts if fact.wide and fact.text]
+        parts.append(self.facts(FactList(page.facts)))
         parts.append("\n".join(f"- **{self.escaped(caution)}**" for caution in page.cautions))
         return "\n\n".join(filter(None, [*parts, self.blocks(page.text_sections)])) + "\n"
 
@@ -160,7 +158,7 @@ class _Markdown(_Text):
         return "\n".join(f"- {self.escaped(fact.name)}: {self.escaped(fact.text)}" for fact in facts)
 
     def _titled(self, title: str, body: str, level: int) -> str:
-        return "\n\n".join(filter(None, (f"{'#' * level} {self.escaped(title)}", body)))
+        return f"{'#' * level} {self.escaped(title)}\n\n{body}"
 
     def _table(self, table: Table, rows: Sequence[Sequence[str]], notes: Sequence[str]) -> str:
         count = f" ({self.escaped(table.count)})" if table.count else ""
@@ -294,7 +292,8 @@ def _section_values(section: Section | Folded) -> dict[str, Any]:
     values: dict[str, Any] = {"title": section.title}
     for block in section.blocks:
         if isinstance(block, Section | Folded):
-            values.setdefault("sections", []).append(_section_values(block))
+            if len(nested := _section_values(block)) > 1:  # more than its title
+                values.setdefault("sections", []).append(nested)
         elif isinstance(block, Table):
             values.setdefault("tables", []).append(_table_values(block))
         elif isinstance(block, FactList):

@@ -24,7 +24,6 @@ RESULT_FILE = "result.json"
 
 _EXPECTED = "a results file, as `coliags eval` writes it"
 _AGAIN = "Restore it, or run `coliags eval` again"
-_MARK = f'"{FORMAT}"'.encode()
 
 
 class NewerResultError(InputError):
@@ -64,42 +63,6 @@ def read_result(path: Path) -> Result:
             _AGAIN,
         )
     return result
-
-
-def find_results(paths: Sequence[Path]) -> list[Result]:
-    """Read the results at some paths, each once: of files with one key the first counts; other values are refused.
-
-    Paths are results files, and folders that are searched for them. Hidden files and folders, such as an interrupted
-    evaluation leaves, are not looked into, nor are JSON files of other content.
-    """
-    by_key: dict[str, tuple[Path, Result]] = {}
-    for path in dict.fromkeys(file.resolve() for place in paths for file in _files(place)):
-        result = read_result(path)
-        other, earlier = by_key.setdefault(result.key, (path, result))
-        if earlier.metrics_sha256 != result.metrics_sha256:
-            raise InputError(
-                f"{other} and {path} are results of the same run, and their values differ",
-                "each run once",
-                "Name the paths of those that count",
-            )
-    return [result for _, result in by_key.values()]
-
-
-def _files(path: Path) -> list[Path]:
-    """The path itself, or the results files in a folder, sorted."""
-    if not path.is_dir():
-        return [path]
-    try:
-        files = sorted(path.rglob("*.json"))
-        visible = [file for file in files if not any(part.startswith(".") for part in file.relative_to(path).parts)]
-        matches = [file for file in visible if file.is_file() and _MARK in file.read_bytes()]
-    except OSError as error:
-        raise InputError(f"{error.filename or path} cannot be read: {error.strerror}", "a readable folder") from error
-    if not matches:
-        raise InputError(
-            f"{path} holds no results", "results files, as `coliags eval` writes them", "Run `coliags eval RUN` first"
-        )
-    return matches
 
 
 @dataclass(frozen=True)

@@ -176,7 +176,7 @@ class AdaptiveDensity(Strategy[AdaptiveDensitySettings]):
 class AnchorGrowthSettings(Settings):
     """Options of anchor growth (docs/methods.md 4.3 lists Scaffold-GS's values). Steps scale with the run."""
 
-    statistics_from: int = Field(default=500, ge=0)  # steps; first and last are themselves left out
+    statistics_from: int = Field(default=500, ge=0)  # step after which gradients and opacities are summed up
     growth_from: int = Field(default=1500, ge=0)  # step after which events grow and prune
     until: int = Field(default=15_000, ge=0)  # step before which the last event is
     every: int = Field(default=100, ge=1)  # steps between events
@@ -184,8 +184,8 @@ class AnchorGrowthSettings(Settings):
     gradient_threshold: float = Field(default=0.0002, gt=0)
     # share of ``every`` steps with an anchor in view for pruning, half of it for growing (docs/methods.md 4.3)
     success_share: float = Field(default=0.8, gt=0, le=1)
-    min_opacity: float = Field(default=0.005, ge=0)  # mean of an anchor's that stays
-    levels: int = Field(default=3, ge=1)  # cells of the anchors' spacing, and each further level a quarter of that
+    min_opacity: float = Field(default=0.005, ge=0)  # least sum of the children's opacities of an anchor that stays
+    levels: int = Field(default=3, ge=1)  # sizes of cells: the anchors' spacing, then a quarter of the one before
     finest_cell: float = Field(default=0.25, ge=0)  # edge of the finest cells, in voxels; finer levels are left out
     pixels_per_birth: int = Field(default=500, ge=1)  # pixels of a view for each birth of an event, strongest first
     max_scale: float | None = Field(default=4.0, gt=0)  # cap on base scales at every event, times the spacing

@@ -78,6 +78,8 @@ def _parts(cell: dict[str, Any]) -> Iterator[str]:
         shown = output.get("data", {"text/plain": output.get("text", "")})
         if "text/html" in shown:
             yield "".join(shown["text/html"])
+        elif "image/jpeg" in shown:
+            yield f'<img alt="" src="data:image/jpeg;base64,{shown["image/jpeg"].strip()}">'
         else:
             yield f"```text\n{''.join(shown['text/plain']).rstrip()}\n```"
 

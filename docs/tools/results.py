@@ -26,7 +26,7 @@ import numpy as np
 
 import coliags_plugin
 from coliags_plugin.comparison.plan import PlannedCell, read_plan
-from coliags_plugin.reporting.colormaps import color_bar, colorize_depth, common_limits, side_by_side, stacked
+from coliags_plugin.reporting.colormaps import color_bar, colorize_depth, depth_limits, side_by_side, stacked
 from coliags_plugin.reporting.model import simple_table
 from coliags_plugin.reporting.text_formats import markdown_table
 from coliags_plugin.results.comparisons import scene_means
@@ -206,7 +206,7 @@ def column(part: str, results: Mapping[str, Result], runs: Mapping[str, coliags_
     views = {name: run.render(frame) for name, run in runs.items()}
     truth = views[SHOWN[0]]
     assert truth.true_rgb is not None and truth.true_depth is not None  # a phantom has both
-    limits = common_limits([truth.true_depth])
+    limits = depth_limits([truth.true_depth])
     rows = [("recorded", truth.true_rgb, truth.true_depth)]
     rows += [(f"{name}, {scores[name][frame]:.1f} dB", view.rgb, view.depth) for name, view in views.items()]
     pictures = [

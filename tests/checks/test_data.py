@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -16,12 +17,15 @@ from coliags_plugin.checks.data.check import check_scene, video_pairs
 from coliags_plugin.checks.data.findings import findings_of, image_facts, lamp_facts, path_facts
 from coliags_plugin.checks.data.hypotheses import CHANGES, FrameMatches, Pair, agreement, best_scale, supported
 from coliags_plugin.checks.data.page import check_page
+from coliags_plugin.cli.texts import depth_commands
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.core.scenes import Frame, PointCloud, Scene, SparseDepth
 from coliags_plugin.datamanagers.c3vd import C3VDDataManager, C3VDSettings
 from coliags_plugin.engine.data_formats import open_scene
 from coliags_plugin.geometry.lenses.models import PinholeLens
+from coliags_plugin.reconstruction.depth.scene import training_options
+from coliags_plugin.reporting.colormaps import HATCH_GREYS
 from coliags_plugin.reporting.text_formats import page_text
 from tests.commands import run
 from tests.datamanagers.wall_scenes import HEIGHT, WIDTH, write_wall
@@ -302,7 +306,7 @@ def test_features_are_matched_at_the_stored_size(frames, tmp_path, capsys, caplo
     write_frames(tmp_path / "tube", frames[:12], depth=False)
     size = ("--set", "width=40", "--set", "datamanager.height=32")  # with and without the prefix
     with caplog.at_level(logging.INFO):
-        status = run("data", "check", tmp_path / "tube", *size)
+        status = run("check", "data", tmp_path / "tube", *size)
     out, log = capsys.readouterr().out, [record.getMessage() for record in caplog.records]
     assert status == 0
     assert "40 x 32 px, stored 160 x 128" in out
@@ -315,7 +319,7 @@ def test_features_are_matched_at_the_stored_size(frames, tmp_path, capsys, caplo
 @pytest.mark.thorough
 @pytest.mark.parametrize(("name", "step"), [("colmap_23img", 1), ("c3vd_cecum_t1_a", 16)])
 def test_real_scenes_are_not_suspected(shared_data, capsys, name, step):
-    assert run("data", "check", shared_data / name, "--set", "max_frames=4", "--set", f"frame_step={step}") == 0
+    assert run("check", "data", shared_data / name, "--set", "max_frames=4", "--set", f"frame_step={step}") == 0
     assert "nothing suspect" in capsys.readouterr().out
 
 
@@ -347,6 +351,13 @@ def test_where_features_fail_points_are_followed(unmatched):
     assert check.matches["given"].error < 1.0
     assert check.matches["given"].count > 500
     assert "Points followed through" in page_text(check_page(check))
+
+
+def test_a_scene_without_dense_depth_is_to_be_given_it(unmatched, monkeypatch, capsys):
+    monkeypatch.setattr("coliags_plugin.engine.data_formats.open_scene", lambda *arguments, **options: unmatched)
+    assert run("check", "data", "SCENE", "--set", "split=block") == 0
+    expected = depth_commands(Path("SCENE"), ["--set", "split=block"], training_options(unmatched))
+    assert capsys.readouterr().out.splitlines()[-2:] == [f"next:    {command}" for command in expected]
 
 
 @pytest.mark.thorough
@@ -398,9 +409,22 @@ def test_another_calibration_of_endogslams_data_is_not_suspected(tmp_path):
     assert "EndoGSLAM's calibration" not in whats(scene)
 
 
+def test_frames_are_shown_reprojected_where_there_is_depth(scene):
+    sections = {section.title: section.blocks for section in check_page(check_scene(scene)).sections}
+    for group in sections["Reprojected frames"]:
+        files = [np.frombuffer(figure.image.data, np.uint8) for figure in group.figures]
+        frame, warped, difference = (cv2.imdecode(file, cv2.IMREAD_COLOR).astype(int) for file in files)
+        hatched = np.isin(difference, HATCH_GREYS).all(axis=2)
+        assert hatched.mean() < 0.5 and (warped[hatched] == difference[hatched]).all()
+        assert np.abs(frame - warped)[~hatched].mean() < 10.0 < np.abs(frame - warped)[hatched].mean()
+    assert [figure.equal_scales for figure in sections["Trajectory"][0].figures] == [False, True, True]
+    bare = check_page(check_scene(each(scene, lambda frame: frame.with_maps(depth=None)), match_images=False))
+    assert "Reprojected frames" in [section.title for section in bare.sections if not section.blocks]
+
+
 @pytest.mark.thorough
 def test_command_says_it_all(folder, scene, tmp_path, capsys):
-    argv = ("data", "check", folder, "--html", tmp_path / "check.html")
+    argv = ("check", "data", folder, "--html", tmp_path / "check.html")
     assert run(*argv) == 0
     out = capsys.readouterr().out
     assert "nothing suspect" in out
@@ -411,7 +435,7 @@ def test_command_says_it_all(folder, scene, tmp_path, capsys):
     assert facts["suspect"] is False
     assert facts["data"]["frames"]["train"] == 21
     page = (tmp_path / "check.html").read_text()
-    assert page.count("<img ") == 18
+    assert page.count("<img ") == 9
     assert "z, mm" in page
 
 
@@ -419,7 +443,7 @@ def test_command_says_it_all(folder, scene, tmp_path, capsys):
 def test_command_fails_on_what_is_suspect(scene, tmp_path, capsys):
     inverted = changed(scene, pose=torch.linalg.inv)
     write_frames(tmp_path / "inverted", inverted.video)
-    assert run("data", "check", tmp_path / "inverted") == 1
+    assert run("check", "data", tmp_path / "inverted") == 1
     assert "Suspect\nposes agree with depth when read as: world-to-camera: " in capsys.readouterr().out
-    assert run("data", "check", tmp_path / "inverted", "--json") == 1
+    assert run("check", "data", tmp_path / "inverted", "--json") == 1
     assert json.loads(capsys.readouterr().out)["suspect"] is True

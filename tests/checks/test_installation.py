@@ -1,4 +1,4 @@
-"""`coliags doctor` on a device: what it finds of renderers that are right, wrong or broken."""
+"""`coliags check installation` on a device: what it finds of renderers that are right, wrong or broken."""
 
 import json
 from dataclasses import replace
@@ -90,16 +90,16 @@ def test_an_exception_is_a_failed_check(small, monkeypatch, capsys):
         raise RuntimeError("\nCUDA error: no kernel image is available.\nCompile with TORCH_USE_CUDA_DSA")
 
     monkeypatch.setattr(CpuRenderer, "draw", broken)
-    assert run("doctor", "--device", "cpu") == 1
+    assert run("check", "installation", "--device", "cpu") == 1
     (line,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("BAD")]
     assert "RuntimeError: CUDA error: no kernel image is available. Until that" in line
-    assert run("doctor", "--device", "cpu", "--json") == 1
+    assert run("check", "installation", "--device", "cpu", "--json") == 1
     (failed,) = [each for each in json.loads(capsys.readouterr().out)["checks"] if each["status"] == "failed"]
     assert "in broken" in failed["traceback"]
 
 
 def test_a_device_that_cannot_be_is_refused(capsys):
-    assert "auto, cpu, cuda or cuda:N" in refused(capsys, "doctor", "--device", "gpu")
+    assert "auto, cpu, cuda or cuda:N" in refused(capsys, "check", "installation", "--device", "gpu")
 
 
 @pytest.mark.gpu

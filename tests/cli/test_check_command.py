@@ -38,7 +38,7 @@ SMALL = ("--steps", 10, "--set", "datamanager.points_count=500")
 def test_a_sound_method(tmp_path_factory, capsys, monkeypatch):
     temporary = tmp_path_factory.mktemp("temporary")  # where the phantom stays for other tests
     monkeypatch.setattr("tempfile.tempdir", str(temporary))
-    assert run("check", "3dgs", *SMALL) == 0
+    assert run("check", "method", "3dgs", *SMALL) == 0
     *lines, last = capsys.readouterr().out.splitlines()
     names = sorted(map(name_of_check, METHOD_CHECKS), key=len, reverse=True)
     assert [re.match(rf"[✓-] ({'|'.join(names)}) ", text)[1] for text in lines] == [*map(name_of_check, METHOD_CHECKS)]
@@ -52,7 +52,7 @@ def test_a_crash_in_a_users_file_is_a_failed_check(tmp_path, capsys, monkeypatch
     monkeypatch.setattr(registry, "losses", None)
     monkeypatch.setitem(registry.REGISTRIES, "losses", registry.Registry("losses", _BUILT_IN, "loss"))
     sharp = ("--set", "losses.sharp={name: sharp, weight: 0.1}", "--traceback")
-    assert run("check", "3dgs", *SMALL, *sharp) == 1
+    assert run("check", "method", "3dgs", *SMALL, *sharp) == 1
     out = capsys.readouterr().out
     (failed,) = re.findall(r"^✗ .*$", out, re.MULTILINE)
     assert re.search(
@@ -68,16 +68,16 @@ _BUILT_IN = {name: registry.losses._targets[name] for name in ("l1", "d-ssim")}
 
 def test_what_is_kept_can_be_looked_at(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
-    assert run("check", "3dgs", "--data", write_wall(tmp_path / "wall", frames=17), *SMALL, "--keep") == 0
+    assert run("check", "method", "3dgs", "--data", write_wall(tmp_path / "wall", frames=17), *SMALL, "--keep") == 0
     folder = Path(capsys.readouterr().out.splitlines()[-1].removeprefix("written: "))
     assert (folder / "run" / "eval" / "paper" / "metrics.json").is_file()
     assert not (folder / "phantom").exists()
 
 
 def test_input_that_cannot_be_checked(tmp_path, capsys):
-    assert "Did you mean 'coliags'" in refused(capsys, "check", "colliags")
-    assert "Expected 10 or more" in refused(capsys, "check", "coliags", "--steps", 9)
-    assert "no folder" in refused(capsys, "check", "coliags", "--data", tmp_path / "gone")
+    assert "Did you mean 'coliags'" in refused(capsys, "check", "method", "colliags")
+    assert "Expected 10 or more" in refused(capsys, "check", "method", "coliags", "--steps", 9)
+    assert "no folder" in refused(capsys, "check", "method", "coliags", "--data", tmp_path / "gone")
 
 
 def test_results_are_lines_that_every_encoding_can_print(monkeypatch):
@@ -86,7 +86,7 @@ def test_results_are_lines_that_every_encoding_can_print(monkeypatch):
     assert summary(results) == "1 passed, 0 failed, 1 skipped in 0.0 s"
     written = io.BytesIO()
     monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(written, encoding="ascii", write_through=True))
-    assert run("check", "coliags", "--set", "field.voxels=1") == 1
+    assert run("check", "method", "coliags", "--set", "field.voxels=1") == 1
     first, *others, _ = written.getvalue().decode("ascii").splitlines()
     assert re.match(r"\\u2717 resolves .* unknown key 'voxels'", first) and {text[0] for text in others} == {"-"}
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import math
+import re
 import shutil
 import signal
 import subprocess
@@ -16,13 +17,14 @@ import numpy as np
 import pytest
 
 from coliags_plugin import Run, load_run, report, train
+from coliags_plugin.cli.texts import depth_commands, train_command
 from coliags_plugin.comparison.scenes import find_scenes
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import read_rgb
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.core.text_files import without_places
 from coliags_plugin.export.splats.formats import write_splats
-from coliags_plugin.reporting.colormaps import hatch
+from coliags_plugin.reporting.colormaps import colorize_error, depth_error, error_limit, hatch
 from coliags_plugin.reporting.image_files import read_depth_tiff
 from tests.commands import refused, run
 from tests.export.splats.clouds import random_cloud
@@ -93,6 +95,12 @@ def test_render_writes_images_scales_a_video_and_depth_as_numbers(trained, tmp_p
         picture = read_rgb(out / "depth" / f"{name}.png")
         low = view.alpha < 0.5
         assert (picture[low] == hatch(*low.shape)[low]).all()
+    views = [handle.render(name, depth=f"depth_{kind}") for name in handle.frame_names()]
+    errors = [depth_error(view.depth, view.true_depth) for view in views]
+    for view, error in zip(views, errors, strict=True):
+        drawn = colorize_error(error, error_limit(errors))
+        np.testing.assert_array_equal(read_rgb(out / "depth_error" / f"{view.name}.png"), drawn)
+        assert np.median(read_rgb(out / "rgb_error" / f"{view.name}.png")) > 20, "most errors are black"
     for folder in ("rgb", "depth", "rgb_error", "depth_error"):
         images = sorted((out / folder).iterdir())
         assert [path.stem for path in images] == [*handle.frame_names()]
@@ -102,9 +110,16 @@ def test_render_writes_images_scales_a_video_and_depth_as_numbers(trained, tmp_p
         assert (out / f"{scale}.png").is_file()
 
 
+def test_single_frames_are_rendered_without_a_video(trained, tmp_path):
+    assert run("render", trained, "--frames", "0003_color", "test", "0008_color", "--output", tmp_path / "out") == 0
+    names = [path.stem for path in sorted((tmp_path / "out/rgb").iterdir())]
+    assert names == ["0000_color", "0003_color", "0008_color", "0016_color"]
+    assert not (tmp_path / "out/trajectory.mp4").exists()
+
+
 def test_eval_shows_the_expected_depth(trained):
     folder, handle = trained / "eval" / "paper", load_run(trained, device="cpu")
-    assert (folder / "depth_pictures" / "scale.png").is_file()
+    assert (folder / "depth_pictures" / "scale.png").is_file() and (folder / "errors" / "test_scale.png").is_file()
     record = handle.results["paper"].sets["test"]
     low = []
     for name in handle.frame_names():
@@ -154,18 +169,38 @@ def test_default_run_folder_and_resume_of_the_newest(scene, tmp_path, monkeypatc
     assert (printed / "checkpoints" / "step-000002").is_dir()
 
 
-def test_list_and_config_and_doctor_and_a_dry_run_of_an_ablation(scene, tmp_path, capsys):
-    argv = ("ablate", "embedding-sizes", "--scenes", scene, "--output", tmp_path / "new", "--dry-run")
+def test_list_and_config_and_the_installation_and_a_dry_run_of_an_ablation(scene, tmp_path, capsys):
+    argv = ("compare", "embedding-sizes", "3dgs", "--scenes", scene, "--output", tmp_path / "new", "--dry-run")
     assert run(*argv) == 0
-    assert "seed 0" in capsys.readouterr().out and not any(tmp_path.iterdir())
+    planned = capsys.readouterr().out
+    assert "wall 5-5 seed 0" in planned and "wall 3dgs seed 0" in planned and not any(tmp_path.iterdir())
     assert run("list", "methods") == 0
     assert "scaffold-gs-depth" in capsys.readouterr().out
     assert run("list") == 0
     assert "renderers:" in capsys.readouterr().out
-    assert run("config", "show", "coliags", "--origin") == 0
-    assert "frequencies: 10  # coliags.yaml:" in capsys.readouterr().out
-    assert run("doctor") == 0
+    assert run("config", "coliags") == 0
+    assert re.search(r"frequencies: 10  # coliags.yaml:\d+: Frequencies of gamma", capsys.readouterr().out)
+    assert run("check", "installation") == 0
     assert "would use cpu" in capsys.readouterr().out
+
+
+def test_a_kind_and_a_component_are_described(capsys):
+    assert run("list", "losses") == 0
+    assert re.search(r"^l1 +Mean absolute difference over valid pixels", capsys.readouterr().out, re.MULTILINE)
+    assert run("list", "appearance_heads", "imia") == 0
+    printed = capsys.readouterr().out
+    assert printed.startswith("imia (built in): Improved Appearance Modeling")
+    assert (
+        "\nbias_init    one of scene_distances, pytorch  scene_distances  Initial biases of hidden units.\n" in printed
+    )
+    assert printed.endswith("\ncolor_mlp        {lr: 0.008, final_lr: 5.0e-05}\n")
+    assert run("list", "losses", "depth-huber", "--json") == 0
+    described = json.loads(capsys.readouterr().out)
+    weight, delta = described["options"][0], described["options"][-1]
+    assert (weight["name"], weight["type"], "default" in weight) == ("weight", "number", False)
+    assert (delta["name"], delta["type"], delta["default"]) == ("delta", "number, > 0", 0.2)
+    assert "no loss 'depth-hubr'" in refused(capsys, "list", "losses", "depth-hubr")
+    assert "no kind of components 'methods'" in refused(capsys, "list", "methods", "coliags")
 
 
 # Bad input
@@ -188,7 +223,9 @@ def test_list_and_config_and_doctor_and_a_dry_run_of_an_ablation(scene, tmp_path
         ("eval .", "not a run folder"),
         ("eval RUN --protocol papper", "Did you mean 'paper'"),
         ("render .", "not a run folder"),
-        ("render RUN --frames rotation", "one of train, test, all"),
+        ("render RUN --frames rotation", "Expected train, test, all, or the name of a frame such as 0001_color"),
+        ("render RUN --frames test 0002_colour", "Did you mean '0002_color'"),
+        ("compare paper-row --scenes SCENE", "Did you mean 'paper-rows'"),
         ("list renderer", "Did you mean 'renderers'"),
     ],
 )
@@ -217,6 +254,15 @@ def test_what_train_and_phantom_cannot_make(capsys, scene, tmp_path):
     for words in options:
         refused(capsys, "phantom", "-o", tmp_path / "p", *words.split())
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+@pytest.mark.parametrize(
+    ("layout", "commands"), [("colmap", depth_commands(Path("colon"))), ("c3vd", [train_command(Path("colon"))])]
+)
+def test_a_phantom_without_depth_leads_to_it(monkeypatch, capsys, layout, commands):
+    monkeypatch.setattr("coliags_plugin.api.scenes.make_phantom", lambda output, **options: output)
+    assert run("phantom", "-o", "colon", "--layout", layout) == 0
+    assert capsys.readouterr().out.splitlines() == ["written: colon", *(f"next:    {each}" for each in commands)]
 
 
 # Processes
@@ -298,7 +344,7 @@ def test_home_folder(tmp_path, janes, monkeypatch, capsys):
     (tmp_path / "base.yaml").write_text("base: scaffold-gs\n")
     (tmp_path / "own.yaml").write_text("base: ~/base.yaml\n")
     points = ("initial_points=file", "points_file=~/Jane Doe/points.ply")
-    assert run("data", "check", f"{home}/scene", "--html=~/page.html", "--set", points[0], "--set", points[1]) in (0, 1)
+    assert run("check", "data", f"{home}/scene", "--html=~/page.html", "--set", points[0], "--set", points[1]) in (0, 1)
     assert (tmp_path / "page.html").is_file() and "points.ply" in capsys.readouterr().out
     trained = train("~/own.yaml", f"{home}/scene", output="~/run", steps=1, renderer="torch", settings=SMALL)
     assert trained.path == tmp_path / "run" == Run("~/run").path and (tmp_path / "run/config.yaml").is_file()
@@ -306,12 +352,12 @@ def test_home_folder(tmp_path, janes, monkeypatch, capsys):
         report("~/run")  # was not evaluated
     (tmp_path / "bench.yaml").write_text("description: One scene\nscenes:\n  wall: {folder: ~/Jane Doe/scene}\n")
     assert [str(source.path) for source in find_scenes(["~/bench.yaml"], None)] == [str(janes)]
-    refused(capsys, "data", "check", "~nobody-of-this-name/scene")
+    refused(capsys, "check", "data", "~nobody-of-this-name/scene")
 
 
 def test_of_checks(tmp_path, janes, capsys):
     out = tmp_path / "out"
-    assert run("data", "check", janes, "--html", out / "check.html", "--json") in (0, 1)
+    assert run("check", "data", janes, "--html", out / "check.html", "--json") in (0, 1)
     printed = json.loads(capsys.readouterr().out)
     summary = json.dumps({key: value for key, value in printed.items() if key not in ("written", "next")})
     assert "Jane Doe" not in summary and str(tmp_path) not in summary

@@ -14,11 +14,11 @@ import pytest
 import tyro
 
 import coliags_plugin as cp
-from coliags_plugin.cli import COMMANDS, poses
-from coliags_plugin.cli.comparing import CompareCommand
-from coliags_plugin.cli.texts import in_flags, print_summary, translate_for
+from coliags_plugin.cli import COMMANDS, checks, poses
+from coliags_plugin.cli.texts import depth_commands, in_flags, print_summary, translate_for
 from coliags_plugin.config.options import TrainOptions, takes
 from coliags_plugin.core import __version__
+from coliags_plugin.core.scenes import TO_GET_DEPTH
 from tests.commands import run
 
 #: Functions of the Python API by the class of their options.
@@ -31,11 +31,11 @@ FUNCTIONS = {
 
 @pytest.mark.parametrize(("options", "function"), FUNCTIONS.items(), ids=lambda value: value.__name__)
 def test_a_command_and_a_function_have_the_same_options_and_the_help_tells_them(options, function):
-    assert any(issubclass(command, options) for command in COMMANDS.values())
+    assert any(issubclass(command, options) for command in commands().values())
     shown = signature(function).parameters
     for name in {field.name for field in fields(options)} - {"data", "data_format", "device", "overwrite"}:
         assert name in shown
-        assert f"\n    {name}: " in function.__doc__ or "options: See :func:`compare`." in function.__doc__
+        assert f"\n    {name}: " in function.__doc__
 
 
 def test_options_are_given_as_an_object_or_by_name_with_texts_and_mappings():
@@ -60,8 +60,9 @@ NAMES |= {"settings": "set", "formats": "format"}
 
 def commands() -> dict[str, type]:
     """Every command by the name of its class."""
-    parts = [kind for kind, _ in map(typing.get_args, typing.get_args(poses.Subcommand))]
-    return {kind.__name__: kind for kind in (*COMMANDS.values(), *parts) if kind is not poses.PosesCommand}
+    groups = {poses.PosesCommand: poses.Subcommand, checks.CheckCommand: checks.Subcommand}
+    parts = [typing.get_args(part)[0] for union in groups.values() for part in typing.get_args(union)]
+    return {kind.__name__: kind for kind in (*COMMANDS.values(), *parts) if kind not in groups}
 
 
 @pytest.mark.parametrize("kind", commands().values(), ids=commands())
@@ -74,11 +75,16 @@ def test_options_come_in_one_order(kind):
     assert not {"out", "save"} & set(hints) and "output" not in positional
     if "output" in names:
         assert set(names[: names.index("output")]) <= {"scenes", "data"} & set(required), "the subject comes first"
-    if kind is CompareCommand:
-        assert "output" in required
-        assert signature(cp.compare).parameters["output"].default == Path("comparison")
     tail = [name for name in names if name in TAIL and name not in required]
     assert tail == sorted(tail, key=TAIL.index)
+
+
+def test_commands_for_depth_are_those_of_the_messages():
+    assert re.findall("`(.+?)`", TO_GET_DEPTH) == depth_commands(Path("SCENE"))
+    assert in_flags(TO_GET_DEPTH) == TO_GET_DEPTH
+    estimate, train = depth_commands(Path("my scene"), ["--set", "frame_step=2"], ["datamanager.split=block"])
+    assert estimate == "coliags depth 'my scene' --output 'my scene-depth' --set frame_step=2"
+    assert train == "coliags train coliags-plus --data 'my scene-depth' --set datamanager.split=block"
 
 
 def test_a_summary_for_people_and_for_scripts(capsys):
@@ -95,7 +101,7 @@ def test_a_summary_for_people_and_for_scripts(capsys):
     ("message", "typed"),
     [
         ("Pass `resume=True`, or another `output`", "Pass --resume, or another --output"),
-        ("`steps=3` and `data_format=c3vd`", "--steps 3 and --format c3vd"),
+        ("`steps=3` and `data_format=c3vd`", "--steps 3 and --data-format c3vd"),
         ("Remove it with `losses.depth=null`", "Remove it with --set losses.depth=null"),
         ('`optimizers."field.x"={lr: 0.001}`', "--set 'optimizers.\"field.x\"={lr: 0.001}'"),
         ("no key `wants`; see `coliags eval RUN` and `method`", "no key `wants`; see `coliags eval RUN` and `method`"),

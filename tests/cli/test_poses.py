@@ -188,7 +188,7 @@ def test_sfm_makes_a_scene_that_trains_and_aligns(tube, tmp_path, capsys, caplog
     assert open_scene(out).provenance.unit == "unknown"
     assert end == [
         f"written: {out}",
-        f"next:    coliags depth estimate {out} --output {out}-depth",
+        f"next:    coliags depth {out} --output {out}-depth",
         f"next:    coliags train coliags-plus --data {out}-depth",
     ]
     assert sorted(path.name for path in (out / "images").iterdir()) == [f"{n:04d}_color.png" for n in range(0, 9, 2)]
@@ -210,8 +210,8 @@ def test_a_known_distance_or_diameter_fixes_the_scale(tube, tmp_path, capsys, ca
     truth = np.stack([frame.camera.camera_to_world.numpy() for frame in tube_frames(COUNT)])
     first, last = truth[0, :3, 3], truth[8, :3, 3]
     argv = ("poses", "sfm", tube / "images", *CAMERA, "--every", 4)
-    distance = f"0000_color.png,0008_color,{np.linalg.norm(last - first)}"
-    assert run(*argv, "--output", tmp_path / "by-distance", "--distance", distance) == 0
+    distance = ("0000_color.png", "0008_color", np.linalg.norm(last - first))
+    assert run(*argv, "--output", tmp_path / "by-distance", "--distance", *distance) == 0
     assert "unit: mm, " in capsys.readouterr().out
     assert read_unit(tmp_path / "by-distance") == "mm"
     scene = open_scene(tmp_path / "by-distance", options=["split=all-train"])
@@ -228,10 +228,9 @@ def test_a_known_distance_or_diameter_fixes_the_scale(tube, tmp_path, capsys, ca
 @pytest.mark.parametrize(
     ("argv", "message"),
     [
-        (("--diameter", "0"), "--diameter 0. Expected a length in mm above 0"),
-        (("--diameter", "40", "--distance", "a,b,1"), "--diameter and --distance. Expected one of them"),
-        (("--distance", "a,b"), "IMAGE,IMAGE,MM"),
-        (("--distance", "a,b,nan"), "a length in mm above 0"),
+        (("--diameter", "0"), "0 mm by --diameter or --distance. Expected one length above 0"),
+        (("--diameter", "40", "--distance", "a", "b", "1"), "40 mm and 1 mm by --diameter or --distance. Expected one"),
+        (("--distance", "a", "b", "nan"), "nan mm by --diameter or"),
         (("--camera", "c3vd", "--params", "1,2"), "--params, and --camera c3vd"),
         (("--set", "camera.field_of_view=[90, 20]"), "two ascending angles"),
         (("--camera", "PINHOLE", "--params", "1,2"), "2 parameters for PINHOLE"),

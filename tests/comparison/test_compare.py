@@ -18,11 +18,14 @@ from coliags_plugin.comparison.named_files import Variant
 from coliags_plugin.comparison.plan import make_cells, read_plan
 from coliags_plugin.comparison.scenes import SceneSource
 from coliags_plugin.config.options import CompareOptions
+from coliags_plugin.core import registry
 from coliags_plugin.core.errors import InputError, InterruptedRunError
+from coliags_plugin.core.registry import REGISTRIES, Registry, register
 from coliags_plugin.datamanagers.c3vd import C3VDDataManager
 from coliags_plugin.engine.evaluator import evaluate
 from coliags_plugin.engine.tasks import TaskOutcome
 from coliags_plugin.engine.trainer import Trainer
+from coliags_plugin.losses.target import L1Loss
 from coliags_plugin.phantom.settings import PhantomSettings
 from coliags_plugin.results.reading import NewerResultError, read_result
 from tests.commands import run
@@ -83,6 +86,15 @@ def test_what_is_done_is_not_run_again(wall, folder, monkeypatch, lost, count):
     comparison, ran = again(wall, folder)
     assert not comparison.failures and len(ran) == count and hashes(folder) == before
     assert [result.method for result in comparison.results] == ["coliags", "scaffold-gs"]
+
+
+def test_components_that_workers_do_not_see_are_refused_before_anything_runs(wall, tmp_path, monkeypatch):
+    losses = Registry("losses", registry._BUILT_INS[("losses", "loss")], "loss")
+    monkeypatch.setitem(REGISTRIES, "losses", losses)
+    register("losses", "ours", L1Loss)
+    with pytest.raises(InputError, match=r"method 'ours' uses 'ours' of losses, .* COLIAGS_PLUGIN_PATH"):
+        compare_inline([Variant("ours", "coliags", ("losses.l1={name: ours, weight: 1.0}",))], [wall], tmp_path / "new")
+    assert not (tmp_path / "new").exists()
 
 
 def test_views_that_show_nothing_are_told(wall, folder, caplog):
@@ -400,7 +412,7 @@ def test_a_phantom_to_be_made_has_a_cell_without_a_key(tmp_path, layout):
     ("options", "message"),
     [
         ({"methods": []}, "no method"),
-        ({"methods": ["colias"]}, "no method 'colias'.*Did you mean 'coliags'"),
+        ({"methods": ["colias"]}, "no method or ablation 'colias'.*Did you mean 'coliags'"),
         ({"methods": ["coliags", "coliags"]}, "more than one method is named coliags"),
         ({"seeds": 0}, "`seeds=0`"),
         ({"steps": 0}, "`steps=0`"),

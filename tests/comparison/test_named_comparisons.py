@@ -9,9 +9,16 @@ from pathlib import Path
 
 import pytest
 
-from coliags_plugin.comparison.named_files import ABLATIONS, load_ablation, load_benchmark, shipped
+from coliags_plugin.comparison.named_files import (
+    ABLATIONS,
+    Variant,
+    load_ablation,
+    load_benchmark,
+    shipped,
+    variants_of,
+)
 from coliags_plugin.comparison.scenes import find_scenes
-from coliags_plugin.config.method_config import descriptions, load_method
+from coliags_plugin.config.method_config import descriptions, load_method, method_files
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.registry import phantom_layouts
 from coliags_plugin.phantom.generate import resolve
@@ -131,6 +138,17 @@ def test_short_forms(written, tmp_path):
         "both": ("3dgs", ("field.sh_degree=0",)),
         "joined": ("coliags", ("field.voxel_pixels=1", "field.features=8", "field.children=4")),
     }
+
+
+def test_a_name_or_file_is_a_method_or_an_ablation(written, tmp_path, monkeypatch):
+    assert not method_files().keys() & shipped(ABLATIONS).keys()
+    assert variants_of("coliags") == [Variant("coliags", "coliags")]
+    assert variants_of("embedding-sizes") == load_ablation("embedding-sizes")
+    assert variants_of(name := written("base: coliags\n")) == [Variant("mine", name)]
+    assert [each.name for each in variants_of(written("description: x\nvariants: {a: coliags, b: 3dgs}"))] == ["a", "b"]
+    monkeypatch.setattr(f"{variants_of.__module__}.method_files", lambda: {"rivals": tmp_path / "rivals.yaml"})
+    with pytest.raises(InputError, match=r"'rivals' is a method and an ablation.*Give its file, .*rivals.yaml"):
+        variants_of("rivals")
 
 
 # Scenes

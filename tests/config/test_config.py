@@ -12,16 +12,33 @@ import yaml
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from coliags_plugin.config.method_config import descriptions, load_method, method_files, method_folder
-from coliags_plugin.config.yaml_tree import assignments, parse_assignments, parse_tree, parse_value
+from coliags_plugin.config.method_config import (
+    descriptions,
+    load_method,
+    method_files,
+    method_folder,
+    method_name,
+    method_text,
+)
+from coliags_plugin.config.yaml_tree import (
+    assignments,
+    dump,
+    dump_inline,
+    parse_assignments,
+    parse_tree,
+    parse_value,
+    plain_value,
+)
 from coliags_plugin.core import registry
 from coliags_plugin.core.errors import InputError
+from tests.commands import refuses
 
 
 @pytest.fixture
 def method_file(tmp_path):
     def write(text, name="mine.yaml"):
-        path = tmp_path / name
+        path = tmp_path / "here" / name
+        path.parent.mkdir(exist_ok=True)
         path.write_text(text)
         return str(path)
 
@@ -67,7 +84,7 @@ def test_methods_that_differ_in_one_option_of_the_appearance_head_alone(method, 
     assert first.pop("description") != second.pop("description")
     assert tuple(config["field"]["appearance_head"].pop(option) for config in (first, second)) == values
     assert first == second
-    assert f"bias_init: scene_distances  # {method}.yaml:" in load_method(method).with_origins()
+    assert f"bias_init: scene_distances  # {method}.yaml:" in load_method(method).annotated()
 
 
 @pytest.mark.parametrize(
@@ -118,6 +135,8 @@ RATE = "optimizers.features.lr"
         ("", ["field.geometry_head.frequencies=8", f"{RATE}=1e-3"], {f"{HEAD}.settings.frequencies": 8, RATE: 1e-3}),
         ("", ["losses.depth.final_weight=null", "losses.depth.weight=0"], {"losses.depth.settings.weight": 0.0}),
         ("", [f"{RATE}=0"], {RATE: 0.0}),
+        ("", ["optimizers.features.beta2=0.5"], {RATE: 0.0075, "optimizers.features.beta2": 0.5}),
+        ("optimizers: {offsets: {lr: 1.0}}\n", ["optimizers.offsets=null"], {"optimizers.offsets.lr": 0.01}),
         ("", ["sampler=pixels", "sampler.pixels=7"], {"sampler.name": "pixels", "sampler.settings.pixels": 7}),
         ("", ["losses={l1: {name: l1, weight: 1}}", "losses.l1.weight=0.5"], {"losses.l1.settings.weight": 0.5}),
     ],
@@ -129,11 +148,54 @@ def test_files_and_overrides_change_what_they_inherit(method_file, text, overrid
     assert hasattr(looked_up(config, f"{HEAD}.settings"), "frequencies") == ("plain" not in text)
 
 
-def test_origins_name_file_and_line_or_the_option():
-    text = load_method("coliags", ["field.geometry_head.frequencies=8"]).with_origins()
-    for part in ("# scaffold-gs.yaml:", "# coliags.yaml:", "# default", "# `field.geometry_head.frequencies=8`"):
-        assert part in text
-    assert yaml.safe_load(text)["field"]["geometry_head"]["frequencies"] == 8
+def test_comments_tell_file_and_line_or_the_option_and_the_meaning():
+    loaded = load_method("coliags", ["field.geometry_head.frequencies=8", "modules.exposure=gain"])
+    lines = [line.strip() for line in loaded.annotated().splitlines()]
+    option, meaning = "field.geometry_head.frequencies=8", "Frequencies of gamma, per component of the direction."
+    assert f"frequencies: 8  # `{option}`: {meaning}" in lines
+    meaning = "Learned factor on the rendered colours for each training frame."
+    assert f"name: gain  # `modules.exposure=gain`: {meaning}" in lines
+    assert "features: 32  # scaffold-gs.yaml:10: Feature channels per anchor, input of the heads." in lines
+    assert "max_gain: 8.0  # default: Gains are at least 1 / max_gain and at most max_gain." in lines
+    assert "schedule:  # How long to train and how often to write." in lines
+    assert yaml.safe_load(loaded.annotated()) == yaml.safe_load(loaded.config.to_yaml())
+
+
+@pytest.mark.parametrize(
+    "mapping",
+    [
+        {"base": "coliags", "field": {"voxel_size": np.float32(2.0)}, "losses": {"depth": None}},
+        {"description": "d", "base": Path("mine.yaml"), "strategy": {"name": "none"}, "schedule": {"steps": 7}},
+        {"base": "~/mine.yaml", "losses": {"edges": {"name": "d-ssim", "weight": 1e-5}}},
+        load_method("3dgs").config.model_dump(),
+    ],
+)
+def test_a_mapping_is_a_method_like_the_same_file(method_file, mapping, monkeypatch, tmp_path):
+    folder = Path(method_file("base: scaffold-gs\nfield: {voxel_size: 3.0}\n")).parent
+    monkeypatch.setenv("HOME", str(folder))
+    monkeypatch.chdir(folder)
+    text = method_text({"name": "my method", **mapping})
+    monkeypatch.chdir(tmp_path.parent)  # as a worker, which may be elsewhere
+    loaded = load_method(text)
+    plain = parse_value(dump_inline(plain_value(mapping, "")))
+    assert loaded.config == load_method(method_file(dump(plain), "same.yaml")).config
+    assert (loaded.name, method_name(method_text(mapping))) == ("my method", "mapping")
+    assert method_text(Path("a.yaml")) == method_text("a.yaml") == "a.yaml"
+
+
+@pytest.mark.parametrize(
+    ("mapping", "message"),
+    [
+        ({"base": "coliags", "feild": {}}, "mapping: feild: unknown key 'feild'.*Did you mean 'field'"),
+        ({"base": "coliags", "field": {"voxel_sise": 1}}, "mapping: field.voxel_sise: .*Did you mean 'voxel_size'"),
+        ({"base": "coliag"}, "no method 'coliag'.*Did you mean 'coliags'"),
+        ({"field": "anchors"}, "mapping: losses: is missing"),
+        ({"base": "coliags", "losses": {"mine": object()}}, "setting mapping.losses.mine is a object"),
+        (["coliags"], r"method \['coliags'\]. Expected a name, the path of a YAML file, or a mapping"),
+    ],
+)
+def test_mistakes_in_a_mapping_are_named(mapping, message):
+    refuses(message, lambda: load_method(method_text(mapping)))
 
 
 @pytest.mark.parametrize(
@@ -145,7 +207,8 @@ def test_origins_name_file_and_line_or_the_option():
         ("base: coliags\nfield: {near_plane: 0.2}\n", ["mine.yaml:2", "unknown key 'near_plane'"]),
         ("a: " + "[" * 500, ["nested too deeply"]),
         ("a: &a {b: *a}\n", ["nested too deeply"]),
-        (f"a: {'9' * 5000}\n", ["4300 digits"]),
+        (f"base: coliags\na: {'9' * 5000}\n", ["mine.yaml:2: Exceeds the limit (4300 digits)"]),
+        ("2020-13-45: a\n", ["mine.yaml: month must be in 1..12"]),
         ("base: coliags\nnear_plane: -1.0\n", ["mine.yaml:2", "near_plane", "greater than or equal to 0"]),
         ("base: coliags\nrenderer: {name: cpu, eps: 1.0}\n", ["unknown key 'eps'", "Did you mean 'eps2d'"]),
         ("base: coliags\nschedule:\n  steps: many\n", ["mine.yaml:3", "schedule.steps", "'many'"]),
@@ -160,15 +223,21 @@ def test_origins_name_file_and_line_or_the_option():
         ("base: coliags\nschedule: {steps: 5}\nschedule: {steps: 6}\n", ["mine.yaml:3", "twice", "mine.yaml:2"]),
         ("base: coliags\n  bad: [\n", ["mine.yaml:"]),
         ("- a\n- b\n", ["mine.yaml", "mapping"]),
-        ("base: coliagz\n", ["no method 'coliagz'", "Did you mean 'coliags'"]),
-        ("base: gone.yaml\n", ["gone.yaml"]),
-        ("base: mine.yaml\n", ["inherit from each other"]),
+        ("base: coliagz\n", ["mine.yaml:1: base: no method 'coliagz'", "Did you mean 'coliags'"]),
+        ("description: x\nbase: 0123456789.yaml\n", ["mine.yaml:2: base: no file ", "See `coliags list methods`"]),
+        ("base: odd.yml\n", ["mine.yaml:1: base: no file ", "Did you mean 'odd.yaml'?"]),
+        ("base: coliags.yaml\n", ["mine.yaml:1: base: no file ", "Did you mean 'coliags'?"]),
+        ("base: mine.yaml\n", ["mine.yaml:1: base: method configs inherit from each other: mine.yaml -> mine.yaml"]),
+        ("base: ./../here/mine.yaml\n", ["mine.yaml:1: base: method configs inherit from each other"]),
+        ("base: odd.yaml\n", ["mine.yaml:1: base: odd.yaml holds tuple"]),
         ("base: 3\n", ["mine.yaml:1", "base is 3"]),
+        ("base: {name: coliags}\n", ["mine.yaml:1: base is {'name': 'coliags'}"]),
         ("description: lonely\n", ["datamanager: is missing"]),
         ("base: scaffold-gs\nlosses: {l1: null, d-ssim: null, scale-volume: null}\n", ["losses", "at least 1 item"]),
     ],
 )
 def test_mistakes_are_named(method_file, text, parts):
+    method_file("- a\n", "odd.yaml")
     with pytest.raises(InputError) as caught:
         load_method(method_file(text))
     for part in parts:

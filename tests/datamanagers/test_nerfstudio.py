@@ -17,6 +17,7 @@ import torch
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import read_rgb
 from coliags_plugin.core.ply import point_properties, write_ply
+from coliags_plugin.core.scenes import TO_GET_DEPTH
 from coliags_plugin.datamanagers.recorded import Recording
 from coliags_plugin.geometry.lenses.models import FisheyeLens, Lens, OpenCVLens
 from coliags_plugin.geometry.poses.trajectory import FLIP_Y_AND_Z
@@ -233,7 +234,7 @@ def test_a_scene_whose_images_lie_elsewhere_has_to_be_trusted(mine, tmp_path, st
 
 def test_the_real_sequence_loads_once_it_has_points(shared_data, tmp_path):
     folder = shared_data / "c3vd_cecum_t1_a"
-    with pytest.raises(InputError, match="neither depth files nor"):
+    with pytest.raises(InputError, match=f"neither depth files nor .*{TO_GET_DEPTH}"):
         load(folder, max_frames=2, split="all-train")
     data = np.load(shared_data / "c3vd_sparse_depth/cecum_t1_a_0000.npz")
     np.savez(tmp_path / "points.npz", positions=data["points_world_mm"])

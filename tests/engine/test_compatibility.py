@@ -12,8 +12,9 @@ from coliags_plugin.config.method_config import load_method
 from coliags_plugin.contracts import ViewModule
 from coliags_plugin.core.errors import InputError, NothingDrawnError
 from coliags_plugin.core.provenance import Provenance
-from coliags_plugin.core.scenes import SparseDepth, View
+from coliags_plugin.core.scenes import TO_GET_DEPTH, SparseDepth, View
 from coliags_plugin.engine.model import Model, _check_data, _check_sampler
+from coliags_plugin.fields.heads import MLPAppearanceHead
 from coliags_plugin.losses.target import L1Loss
 from coliags_plugin.modules.exposure import FrameGain
 from coliags_plugin.renderers.splatting import ChosenRenderer
@@ -54,8 +55,6 @@ def test_what_was_made_from_held_out_images_is_warned_of(tmp_path, caplog):
         ("scaffold-gs", ["strategy=adaptive-density"], "strategy 'adaptive-density' changes gaussians"),
         ("scaffold-gs", ["sampler=pixels"], "sampler 'pixels' with renderer 'cpu', which draws whole images"),
         ("scaffold-gs", ["optimizers.mirrors={lr: 0.1}"], "optimizers names mirrors, which the model does not have"),
-        ("scaffold-gs", ["optimizers.features=null"], "optimizers lacks the parameter groups features"),
-        ("scaffold-gs", ["modules.exposure=gain"], "optimizers lacks the parameter groups exposure.gain"),
         ("scaffold-gs", ["renderer=volume"], "renderer 'volume' draws radiance, the field is made of gaussians3d"),
         (
             "scaffold-gs",
@@ -74,8 +73,45 @@ def test_refused_by_name_before_anything_is_written(tmp_path, method, overrides,
 
 def test_any_identifier_names_a_module(tmp_path):
     names = ("train", "keys", "type", "field")
-    overrides = [(f"modules.{name}=gain", f'optimizers."{name}.gain"={{lr: 0.1}}') for name in names]
-    assert set(start(tmp_path / "run", sum(overrides, ())).model.view_modules) == set(names)
+    trainer = start(tmp_path / "run", [f"modules.{name}=gain" for name in names])
+    assert set(trainer.model.view_modules) == set(names)
+
+
+@pytest.mark.parametrize(
+    ("method", "swap", "groups"),
+    [
+        ("coliags", "field.appearance_head.name=attenuated", {"attenuation", "lamp_offset"}),
+        (
+            "coliags",
+            "field.appearance_head={name: attenuated, shadows: true}",
+            {"attenuation", "lamp_offset", "shadow"},
+        ),
+        ("coliags-plus", "field.appearance_head.name=plain", {"exposure.gain", "response.slope"}),
+        ("coliags-plus", "field.geometry_head=plain", {"poses.rotation", "poses.translation", "warp.displacement"}),
+        ("3dgs", "field.name=surfels", {"sh0", "shN"}),
+        ("3dgs", "field={name: lit-gaussians, normal_neighbours: 10}", {"albedos", "lamp"}),
+        ("reim-nerf", "field.width=32", {"coarse", "fine"}),
+    ],
+)
+def test_a_component_brings_its_learning_rates(tmp_path, method, swap, groups):
+    trainer = start(tmp_path / "run", [swap], method)
+    rates = trainer.method.config.optimizers
+    assert trainer.optimizers.adam.keys() == trainer.model.parameter_groups().keys() >= groups
+    assert rates.keys() - trainer.optimizers.adam.keys() <= {"shadow"}  # which is not there without shadows
+    parts = [trainer.method.config.field, *trainer.method.config.modules.values()]
+    declared = {group: rate["lr"] for part in parts for group, rate in part.rates.items()}
+    assert all(rates[group].lr == declared[group.rpartition(".")[2]] for group in groups)
+
+
+def test_groups_without_default_rates_are_named_with_those_of_similar_ones(tmp_path, monkeypatch):
+    monkeypatch.setattr(MLPAppearanceHead, "rates", {})
+    with pytest.raises(InputError, match="optimizers lacks the parameter groups color_mlp, for which") as caught:
+        start(tmp_path / "run")
+    rates = "opacity_mlp: {lr: 0.002, final_lr: 2.0e-05}; covariance_mlp: {lr: 0.004}"
+    assert f'by default, {rates}. Set `optimizers."color_mlp"={{lr: ...}}`' in str(caught.value)
+    monkeypatch.setattr(FrameGain, "rates", {})
+    with pytest.raises(InputError, match=r"parameter groups exposure\.gain, .*, by default, \w+: \{lr: "):
+        start(tmp_path / "run", ["modules.exposure=gain", "optimizers.color_mlp={lr: 0.01}"])
 
 
 def test_a_loss_may_need_any_attribute_of_a_target(monkeypatch):
@@ -97,16 +133,14 @@ def test_terms_count_between_their_steps(tmp_path):
 def test_the_methods_made_for_such_data_are_named(tmp_path, caplog):
     scene, points = wall_scene(), SparseDepth(torch.tensor([[3.5, 2.5]]), torch.tensor([20.0]))
     bare = [frame.with_maps(depth=None) for frame in scene.train]
-    with pytest.raises(InputError, match=r"or make a scene with depth: coliags depth estimate") as caught:
-        start(tmp_path / "run", method="scaffold-gs-depth", scene=replace(scene, train=bare))
-    assert "coliags-plus" not in str(caught.value)
     sparse = [replace(frame, sparse_depth=points) for frame in bare]
-    with pytest.raises(InputError, match=r"train the method coliags-plus on its points, or .* depth estimate"):
-        start(tmp_path / "run", method="scaffold-gs-depth", scene=replace(scene, train=sparse))
-    for train, warned in ((bare, True), (sparse, False)):
+    for train, does in ((bare, "does nothing"), (sparse, "is of single points only"), (scene.train, None)):
         caplog.clear()
         start(tmp_path / "run", method="coliags-plus", scene=replace(scene, train=train))
-        assert ("loss term 'depth' does nothing" in caplog.text) == warned
+        assert (f"loss term 'depth' {does}" in caplog.text, TO_GET_DEPTH in caplog.text) == (does is not None,) * 2
+        if does is not None:
+            with pytest.raises(InputError, match=TO_GET_DEPTH):
+                start(tmp_path / "run", method="scaffold-gs-depth", scene=replace(scene, train=train))
     estimated = [frame.with_maps(depth_confidence=torch.ones_like(frame.depth)) for frame in scene.train]
     for method, warned in (("coliags", True), ("coliags-plus", False), ("scaffold-gs", False)):
         caplog.clear()
@@ -155,7 +189,7 @@ def test_metres_are_refused_and_on_purpose_train_and_see_an_image(tmp_path, meth
     assert trainer.method.config.near_plane == 0.0001
     trainer.start()
     row = trainer.take_step()
-    output, *_ = trainer._render(trainer.sampler.next())
+    output = trainer.render_step().output
     assert row["gaussians"] > 100 and output.alpha.mean() > 0.3
 
 

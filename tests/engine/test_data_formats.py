@@ -77,7 +77,7 @@ def test_options_of_the_method_are_kept_unless_for_another_format(wall, tmp_path
         method = load_method_for(wall, "3dgs", [], data_format)
         assert method.config.datamanager.name == "c3vd"
         assert method.config.datamanager.settings.points_count == 50_000
-        assert "points_count: 50000  # 3dgs.yaml:7" in method.with_origins()
+        assert "points_count: 50000  # 3dgs.yaml:7" in method.annotated()
     mine = tmp_path / "mine.yaml"
     mine.write_text("base: 3dgs\ndatamanager: {name: rotatecolon, points_count: 9}\n")
     kept, dropped = (load_method_for(wall, str(mine), [], name) for name in (None, "c3vd"))

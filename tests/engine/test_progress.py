@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import io
 import json
+import logging
 import sys
 from unittest import mock
 
 import pytest
 from rich.console import Console
 
-from coliags_plugin.contracts import Follower
+from coliags_plugin.contracts import Follower, StopTraining
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.json_files import scalars
 from coliags_plugin.engine import progress as module
@@ -101,7 +102,7 @@ def test_tensorboard_reads_what_the_log_has(tmp_path):
     row = {"step": 3, "loss": 1, "terms": {"l1": 0.5}, "grown": "none", "psnr": 20.0}
     assert scalars(row) == {"loss": 1.0, "psnr": 20.0, "terms/l1": 0.5}
     argv = ("train", "coliags", "--data", write_wall(tmp_path / "wall"), "--output", tmp_path / "run", *SETS)
-    assert run(*argv, "--steps", 4, "--logger", "tensorboard", "--set", "schedule.log_every=1") == 0
+    assert run(*argv, "--steps", 4, "--loggers", "tensorboard", "--set", "schedule.log_every=1") == 0
     rows = [json.loads(line) for line in (tmp_path / "run/metrics.jsonl").read_text().splitlines()]
     scalars_by_step = logged(tmp_path / "run")
     assert scalars_by_step.keys() == scalars(rows[0]).keys()
@@ -144,13 +145,25 @@ def test_followers_change_nothing_and_end_nothing(tmp_path, caplog):
     followed.train(followers=[follower])
     assert without_clock(log_rows(followed)) == without_clock(log_rows(alone))
     assert [call.args for call in follower.stepped.call_args_list] == [(1,), (2,)] and not follower.close.called
-    assert "training goes on without Mock: no space" in caplog.text
+    assert "training goes on without Mock: RuntimeError('no space')" in caplog.text
+
+
+def test_a_follower_ends_training_after_a_step_that_is_saved(tmp_path, caplog):
+    caplog.set_level(logging.INFO)
+    trainer, stopping, other = make_trainer(tmp_path / "run"), mock.Mock(spec=Follower), mock.Mock(spec=Follower)
+    stopping.stepped.side_effect = [None, StopTraining("enough")]
+    trainer.start()
+    trainer.train(followers=[stopping, other])
+    assert trainer.step == trainer.run.step == 2 < trainer.steps
+    assert other.stepped.call_args_list == [mock.call(1), mock.call(2)]
+    assert stopping.close.called and other.close.called
+    assert "Mock ends training: enough" in caplog.text
 
 
 def test_a_missing_library_is_told_before_anything_is_written(tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "wandb", None)
     argv = ("train", "coliags", "--data", write_wall(tmp_path / "wall"), "--output", tmp_path / "run")
-    assert "pip install 'coliags_plugin[loggers]'" in refused(capsys, *argv, "--logger", "wandb")
+    assert "pip install 'coliags_plugin[loggers]'" in refused(capsys, *argv, "--loggers", "wandb")
     assert not (tmp_path / "run").exists()
     with pytest.raises(InputError, match=r"no logger 'tensorbord'.*Did you mean 'tensorboard'"):
         find_loggers(["tensorbord"])

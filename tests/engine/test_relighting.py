@@ -121,7 +121,7 @@ def test_a_relit_run_renders_the_field_under_that_lamp(trained):
 def test_render_under_another_lamp_says_which(trained, tmp_path):
     out = tmp_path / "out"
     light = ("--light", "offset=[5, 0, 0]", "--light", "turn=[0, 20]", "--light", "power=10")
-    assert run("render", trained, "--output", out, *light, "--channel", "albedo", "--channel", "roughness") == 0
+    assert run("render", trained, "--output", out, *light, "--channels", "albedo", "roughness") == 0
     lamp = yaml.safe_load((out / "lamp.yaml").read_text())
     assert lamp == {"offset": [5, 0, 0], "turn": [0, 20], "power": 10, "intensity": 1.0}
     kinds = {path.name for path in out.iterdir() if path.is_dir()}
@@ -140,7 +140,7 @@ def test_render_under_another_lamp_says_which(trained, tmp_path):
         (["--light", "power=-1"], r"lamp option power: .*greater than or equal to 0, got -1"),
         (["--light", "offset=[1, 2]"], r"lamp option offset\.2: is missing"),
         (["--light", "turn=[.nan, 0]"], r"lamp option turn\.0: .*got nan"),
-        (["--channel", "albdo"], "no feature channel 'albdo'.*Did you mean 'albedo'"),
+        (["--channels", "albdo"], "no feature channel 'albdo'.*Did you mean 'albedo'"),
     ],
 )
 def test_bad_options_are_one_message(trained, capsys, options, words):

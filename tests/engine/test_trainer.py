@@ -15,13 +15,16 @@ import pytest
 import torch
 
 from coliags_plugin.config.method_config import load_method
+from coliags_plugin.core import registry
 from coliags_plugin.core.errors import DeviceMemoryError, InputError, InterruptedRunError, NotFiniteError
 from coliags_plugin.core.files import CHECKSUMS, write_checksums
+from coliags_plugin.core.registry import REGISTRIES, Registry, register
 from coliags_plugin.engine import run_folder
 from coliags_plugin.engine.checkpoints import DamagedCheckpointError, read_checkpoint, take_newest
 from coliags_plugin.engine.devices import software
 from coliags_plugin.engine.run_folder import RunFolder
 from coliags_plugin.engine.trainer import Trainer
+from coliags_plugin.losses.target import L1Loss
 from tests.pretended_cuda import CUDA, PretendedCuda
 from tests.scenes import SMALL, wall_scene
 
@@ -108,6 +111,19 @@ def log_rows(trainer):
 
 def without_clock(rows):
     return [{key: value for key, value in row.items() if key != "seconds"} for row in rows]
+
+
+def test_a_loop_of_halves_of_steps_is_training_to_the_bit(tmp_path):
+    overrides = ["modules.exposure={name: gain}", "optimizers={exposure.gain: {lr: 0.01}}"]
+    usual, trainer = train(tmp_path / "a", overrides=overrides), make_trainer(tmp_path / "b", overrides=overrides)
+    trainer.start()
+    while trainer.step < trainer.steps:
+        step = trainer.render_step()
+        terms = {key: loss(step) for key, loss in trainer.losses.items()}
+        weights = {key: trainer.losses[key].settings.weight_at(step.step, trainer.steps) for key in terms}
+        trainer.finish_step(step, torch.stack([weights[key] * term for key, term in terms.items()]).sum())
+    trainer.save()
+    assert_same(final_state(trainer), final_state(usual))
 
 
 @pytest.mark.parametrize(
@@ -223,6 +239,38 @@ def test_other_code_is_recorded_where_a_run_goes_on_with_it(tmp_path, monkeypatc
         changes = RunFolder(tmp_path / "run").provenance()["code_changes"]
         assert changes == [{"at_step": 4, "code": "0123456789abcdef"}]
     assert caplog.text.count("the code has changed since") == 1
+
+
+def test_a_run_records_its_plugins_and_is_not_loaded_without_them(tmp_path, monkeypatch, caplog):
+    plugin, built_in = tmp_path / "mine.py", registry._BUILT_INS[("losses", "loss")]
+    imports = "from coliags_plugin.losses.target import L1Loss"
+    plugin.write_text(f"{imports}\n\n\nclass Mine(L1Loss): ...\n\n\nCOMPONENTS = {{'losses': {{'mine': Mine}}}}\n")
+    monkeypatch.setenv("COLIAGS_PLUGIN_PATH", str(plugin))
+    monkeypatch.setitem(REGISTRIES, "losses", Registry("losses", built_in, "loss"))
+    register("losses", "ours", L1Loss)
+    overrides = ["losses.mine={name: mine, weight: 1.0}", "losses.ours={name: ours, weight: 1.0}"]
+    run = train(tmp_path / "run", steps=2, overrides=overrides).run
+    plugins = run.provenance()["plugins"]
+    assert {name: (each["source"], each["file"]) for name, each in plugins.items()} == {
+        "losses.mine": ("COLIAGS_PLUGIN_PATH", "mine.py"),
+        "losses.ours": ("coliags_plugin.register", "target.py"),
+    }
+    plugin.write_text(f"{plugin.read_text()}# changed\n")
+    make_trainer(run.path, steps=4, overrides=overrides).resume()
+    (change,) = run.provenance()["code_changes"]
+    assert change["plugins"]["losses.ours"] == plugins["losses.ours"]
+    assert change["plugins"]["losses.mine"]["sha256"] != plugins["losses.mine"]["sha256"]
+    monkeypatch.delenv("COLIAGS_PLUGIN_PATH")
+    monkeypatch.setitem(REGISTRIES, "losses", Registry("losses", built_in, "loss"))
+    message = (
+        r"needs loss 'mine', from COLIAGS_PLUGIN_PATH \(mine\.py, SHA-256 \w{8}\.\.\.\)\. .* Set COLIAGS_PLUGIN_PATH"
+    )
+    with pytest.raises(InputError, match=message):
+        run.method()
+    monkeypatch.setenv("COLIAGS_PLUGIN_PATH", str(plugin))
+    monkeypatch.setitem(REGISTRIES, "losses", Registry("losses", built_in, "loss"))
+    with pytest.raises(InputError, match=r"needs loss 'ours', from coliags_plugin\.register .* register it"):
+        run.method()
 
 
 def test_nan_parameters_are_found_in_the_next_step_and_never_saved(tmp_path):

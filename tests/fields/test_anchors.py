@@ -18,7 +18,7 @@ from coliags_plugin.core.components import make_component
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.lamps import FlattenedLight, LightOfCamera
 from coliags_plugin.core.photometry import fit_light
-from coliags_plugin.core.scenes import PointCloud
+from coliags_plugin.core.scenes import TO_GET_DEPTH, PointCloud
 from coliags_plugin.core.shadows import lit_shares
 from coliags_plugin.fields.attenuation import MAX_OFFSET, AttenuatedAppearanceHead
 from coliags_plugin.fields.heads import MAX_TILT, WIDTHS, GlintAppearanceHead, tangent_components
@@ -152,7 +152,7 @@ def test_useless_voxels_are_warned_of_and_no_points_are_an_input_error(caplog):
         make_field(**COLIAGS, voxel_size=0.001)
     assert "merge almost nothing" in caplog.text
     scene = replace(wall_scene(), points=PointCloud(torch.zeros(0, 3)))
-    with pytest.raises(InputError, match="no initial points"):
+    with pytest.raises(InputError, match=f"no initial points.*{TO_GET_DEPTH}"):
         make_field(**COLIAGS, scene=scene, voxel_size=1.0)
 
 

@@ -340,7 +340,7 @@ TARGETS: dict[str, Target] = {
     "data-check": Target(
         "rgbd",
         ("*.txt", "camera.json", "rgb/*", "depth/*"),
-        lambda folder: _command("data", "check", folder, "--json"),
+        lambda folder: _command("check", "data", folder, "--json"),
         True,
     ),
     **{f"poses-{name}": Target("poses", (f"{name}*", f"{name}/*"), _poses(name), True) for name in TRAJECTORIES},

@@ -54,7 +54,7 @@ WRITERS = {
     ),
     "eval": Writer("eval {out}/run --data {seeds}/run/scene", "", needs="run/run"),
     "export": Writer("export {seeds}/run/run -o {out}/cloud.ply"),
-    "report": Writer("report {seeds}/results/run -o {out}/report.html --format all", ""),
+    "report": Writer("report {seeds}/results/run -o {out}/report.html --format all"),
 }
 SLOW_WRITERS = {
     "phantom": Writer(f"phantom -o {{out}}/phantom --frames 9 --size 64x52 --rotation-views 0 {COARSE}"),

@@ -133,7 +133,7 @@ def test_a_named_folder_comes_before_the_environment_s(heads, nowhere, monkeypat
 
 
 def test_missing_weights_say_what_and_how_to_get_it(nowhere, pair, monkeypatch):
-    with pytest.raises(UnavailableError, match=r"vgg16-397923af.pth.*v0.1/vgg.pth.*`coliags weights lpips`") as caught:
+    with pytest.raises(UnavailableError, match=r"vgg16-397923af.pth.*v0.1/vgg.pth.*`coliags weights`") as caught:
         make("lpips", net="vgg")(pair)
     assert str(nowhere) not in str(caught.value), "results are to be the same on every machine"
     monkeypatch.setenv(lpips.WEIGHTS_VARIABLE, str(nowhere))
@@ -354,21 +354,21 @@ def test_weights_of_one_s_own_are_used_with_a_warning(server, cache, made, caplo
 
 
 def test_a_newcomer_s_way(server, cache, capsys):
-    """doctor names the command, which installs; then both say that all is there, and where."""
+    """The check names the command, which installs; then both say that all is there, and where."""
     where = f"LPIPS squeeze: backbone {cache / SQUEEZE[0]}, linear heads {cache / SQUEEZE[1]}\n"
 
-    def doctor():
-        assert run("doctor") == 0
+    def checked():
+        assert run("check", "installation") == 0
         (line,) = [line for line in capsys.readouterr().out.splitlines() if "weights of LPIPS squeeze" in line]
         return line
 
-    line = doctor()
-    assert line.startswith("-  ") and "run `coliags weights lpips`" in line
+    line = checked()
+    assert line.startswith("-  ") and "run `coliags weights`" in line
     for text in (where, f"{where}Everything was there already.\n"):
-        assert run("weights", "lpips", "--net", "squeeze") == 0
+        assert run("weights", "--net", "squeeze") == 0
         assert capsys.readouterr().out == text
     assert len(server.requests) == 2
-    line = doctor()
+    line = checked()
     assert line.startswith("ok ") and line.endswith(f"{cache / SQUEEZE[0]} and {cache / SQUEEZE[1]}")
 
 
@@ -377,7 +377,7 @@ def test_a_folder_of_one_s_own_gets_everything_and_the_command_says_what_to_set(
 ):
     install(NETS, None, made)
     mine = tmp_path / "mine"
-    argv = ("weights", "lpips", "--net", "squeeze", "--from", made, "--folder", mine)
+    argv = ("weights", "--net", "squeeze", "--from", made, "--folder", mine)
     assert run(*argv) == 0
     assert files(mine) == [*SQUEEZE]
     assert f"Set COLIAGS_LPIPS_WEIGHTS={mine} " in capsys.readouterr().out
@@ -397,7 +397,7 @@ def test_offline_all_files_of_the_nets_are_named(cache, monkeypatch, capsys, cho
         raise socket.gaierror(socket.EAI_NONAME, "Name or service not known")
 
     monkeypatch.setattr(socket, "getaddrinfo", unknown)
-    message = refused(capsys, "weights", "lpips", *choice)
+    message = refused(capsys, "weights", *choice)
     assert "cannot download https://raw.githubusercontent.com" in message and "--from FOLDER" in message
     for net, pair in SOURCES.items():
         assert all((published.url in message) == (net in nets) for published in pair)
@@ -405,11 +405,10 @@ def test_offline_all_files_of_the_nets_are_named(cache, monkeypatch, capsys, cho
 
 
 def test_bad_input(capsys, cache, tmp_path):
-    assert "is not a folder" in refused(capsys, "weights", "lpips", "--from", tmp_path / "nothing")
+    assert "is not a folder" in refused(capsys, "weights", "--from", tmp_path / "nothing")
     (tmp_path / "file").write_text("x")
-    assert "cannot write" in refused(capsys, "weights", "lpips", "--folder", tmp_path / "file")
-    assert run("weights") == 2
-    assert run("weights", "lpips", "--net", "resnet") == 2
+    assert "cannot write" in refused(capsys, "weights", "--folder", tmp_path / "file")
+    assert run("weights", "--net", "resnet") == 2
 
 
 # The table

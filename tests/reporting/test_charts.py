@@ -45,6 +45,13 @@ def test_lines_are_drawn_to_scale_within_labelled_axes():
     assert y0 - y1 == pytest.approx(y1 - y2, abs=0.2)
 
 
+@pytest.mark.parametrize("far", [2.0, 40.0])
+def test_a_unit_is_as_long_on_both_axes_where_the_scales_are_equal(far):
+    (line,) = lines(line_chart([Series("path", 0, [0.0, 3.0], [0.0, far])], "x, mm", "y, mm", equal_scales=True))
+    (x0, y0), (x1, y1) = points(line)
+    assert (x1 - x0) / 3.0 == pytest.approx((y0 - y1) / far, rel=0.01) and min(x0, y1) >= 0.0
+
+
 def test_gaps_interrupt_the_line():
     svg = line_chart([Series("a", 0, [1, 2, 3, 4, 5], [1.0, 2.0, math.nan, 3.0, 4.0])], "x", "y")
     assert [len(points(line)) for line in lines(svg)] == [2, 2]
@@ -75,7 +82,7 @@ def test_styles_repeat_with_dashes():
 
 def test_color_bar():
     svg = html_blocks([ColorBar((0.0, 5.0), "mm", "error", "|depth error|", "scale")])
-    assert texts(svg) == ["|depth error| [mm]", "0", "1", "2", "3", "4", "5"]
+    assert texts(svg) == ["|depth error| [mm]", "0", "0.25", "1", "2.5", "5"]
     stops = [element.get("stop-color") for element in ET.fromstring(svg).iter("stop")]
     table = color_table("error")
     assert stops[0] == "#" + bytes(table[0]).hex()

@@ -68,7 +68,7 @@ def test_depth_error_image():
     valid = np.ones((2, 4), bool)
     valid[1, 2] = False
     image = colorize_error(depth_error(torch.from_numpy(rendered), true, valid), limit=2.0)
-    np.testing.assert_array_equal(image[0], table[[0, 128, 255, 255]])
+    np.testing.assert_array_equal(image[0], table[[0, 180, 255, 255]])  # square roots: 0.71 of the scale at half of it
     np.testing.assert_array_equal(image[1, 0], table[255])  # nothing rendered where there is a truth
     np.testing.assert_array_equal(image[1, 1:3], hatch(2, 4)[1, 1:3])
     np.testing.assert_array_equal(image[1, 3], table[0])
@@ -82,7 +82,7 @@ def test_rgb_error_image():
     rendered = true.copy()
     rendered[0, 1] = (51, 0, 0)  # a mean of 17 levels: one third of 0.2
     rendered[0, 2] = 255
-    expected = table[[0, 85, 255]]
+    expected = table[[0, round(255 / math.sqrt(3)), 255]]
 
     def image(*arguments):
         return colorize_error(rgb_error(*arguments), limit=0.2)[0]
@@ -139,7 +139,8 @@ def test_a_scale_of_depth_is_logarithmic_and_names_its_limits():
     assert scale_ticks((10.0, 1000.0), "depth") == [(value, pytest.approx(math.log10(value) / 2 - 0.5)) for value in
                                                     (10.0, 20.0, 50.0, 100.0, 200.0, 500.0, 1000.0)]  # fmt: skip
     assert [tick for tick, _ in scale_ticks((12.0, 85.0), "depth")] == [12.0, 20.0, 40.0, 60.0, 85.0]
-    assert scale_ticks((0.0, 2.0), "error") == [(0.5 * k, pytest.approx(0.25 * k)) for k in range(5)]
+    assert scale_ticks((0.0, 2.0), "error") == [(pytest.approx(tick), pytest.approx(math.sqrt(tick / 2.0))) for tick in
+                                                (0.0, 0.1, 0.4, 1.0, 2.0)]  # fmt: skip
     assert depth_scale_text((12.0, 85.0), "mm") == "12 to 85 mm, logarithmic"
 
 

@@ -90,7 +90,7 @@ def made_page():
             Section("Images", [Figures([Image(image, "a picture") for image in PICTURES], "Two")], screen_only=True),
             Section("Nothing", []),
         ],
-        [Fact("length", 3.14159, "mm^2"), Fact("empty", ""), Fact("long", "words", note="a remark", wide=True)],
+        [Fact("length", 3.14159, "mm^2"), Fact("empty", ""), Fact("long", "words", note="a remark")],
         "Research <use>",
         ["careful"],
     )
@@ -176,9 +176,11 @@ def test_all_formats_have_the_same_numbers(report):
     tables, text, tex = [*tables_of(report.sections)], markdown_text(report), latex_text(report)
     names = [table.name for table in tables]
     assert {"summary-test", "summary-rotation", "lead-test-psnr", "costs", "scene-scene-3-test"} < {*names}
-    assert len(names) == len({*names}) == len({*re.findall(r"\\label\{(.*?)\}", tex)})
+    assert len(names) == len({*names})
     assert sum(cell.stars != "" for table in tables for row in table.cells for cell in row) > 10
-    assert all(markdown_table(table) in text and latex_table(table) in tex for table in tables)
+    means = [table for table in tables if table.name.startswith("summary")]
+    assert all(markdown_table(table) in text and latex_table(table) in tex for table in means)
+    assert text.count("| Method |") == tex.count(r"\label") == len(means) == 2, "details are left out"
     for table in (*tables, PLAIN, MARKED, OF_NASTY_NAMES):
         assert markdown_cells(markdown_table(table)) == said(table)
         assert latex_cells(latex_table(table)) == said(table)
@@ -217,7 +219,7 @@ def test_text_for_the_terminal():
     lines = ["coliags 31.20 ± 0.30*", "other - [a]", "printed 30.1", "[a] no weights.", "± over scenes."]
     assert "\n".join(lines) in re.sub(" +", " ", text)
     assert "what: it is. Mend it" in text and "a/mesh.ply: the mesh" in text
-    assert "a.b  yes\na.c  0.25" in text and "/home" not in text and "Images" not in text and "Nothing" not in text
+    assert not any(word in text for word in ("Recorded", "Nested", "a&b", "Seen", "Images", "Nothing"))
 
 
 def test_html_page(tmp_path):
@@ -265,10 +267,10 @@ def test_pictures_without_room_are_written_beside_the_page(tmp_path):
 
 def test_markdown():
     text = markdown_text(made_page())
-    facts = "- length: 3.142 mm²\n\nlong: words (a remark)\n\n- **careful**"
+    facts = "- length: 3.142 mm²\n- long: words (a remark)\n\n- **careful**"
     assert text.startswith(f"# A & b\n\n> Research \\<use\\>\n\n{facts}")
     assert "**Means** (8 scenes)\n\n| Method | PSNR ↑ \\[dB\\] |\n| --- | ---: |\n" in text
-    assert "<sup>a</sup> no weights.  \n± over scenes." in text and "### Nested\n\n#### More" in text
+    assert "<sup>a</sup> no weights.  \n± over scenes." in text and "Nested" not in text and "Seen" not in text
     assert "[mesh.ply](a/mesh.ply): the mesh" in text
 
 

@@ -1,11 +1,10 @@
-"""Results files: what is read is what was written, and nothing else is read; finding them."""
+"""Results files: what is read is what was written, and nothing else is read."""
 
 from __future__ import annotations
 
 import hashlib
 import json
 import math
-import os
 
 import numpy as np
 import pytest
@@ -14,14 +13,8 @@ from pydantic import ValidationError
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.results import hashing
 from coliags_plugin.results.hashing import ArraysHash, code_key, metrics_sha256, result_key
-from coliags_plugin.results.reading import (
-    find_results,
-    per_frame_table,
-    read_result,
-    write_result,
-)
-from coliags_plugin.results.record import VERSION, CostRecord, ProfileRecord, ProtocolRecord
-from tests.commands import refused, run
+from coliags_plugin.results.reading import facts, per_frame_table, read_result, write_result
+from coliags_plugin.results.record import VERSION, CostRecord, ProfileRecord
 from tests.results.made import METRICS, made_result, made_set
 
 
@@ -248,67 +241,7 @@ def test_a_result_has_means_and_is_shown_in_one_line_and_as_a_table():
     assert result._repr_html_() == table._repr_html_()
 
 
-@pytest.fixture
-def runs(tmp_path):
-    """A folder of a run folder, of a plain results file, and of much else."""
-    folder = tmp_path / "runs"
-    write_result(folder / "one/eval/paper/result.json", made_result())
-    sets = {"test": made_set(), "rotation": made_set(("r",), (20.0,), (1.0,))}
-    other = made_result(sets, key="f" * 16, method="ablations/none", protocol=ProtocolRecord(name="mine", version=3))
-    write_result(folder / "others/any name.json", other)
-    (folder / "one/eval/paper/metrics.json").write_text('{"psnr": 30}')
-    (folder / "one/state.json").write_text("{")
-    (folder / "one/binary.json").write_bytes(bytes(range(256)))
-    (folder / "one/folder.json").mkdir()
-    scratch = folder / "one/eval/.paper.x7f3/result.json"
-    scratch.parent.mkdir()
-    scratch.write_text('{"format": "coliags-result", "vers')
-    return folder
-
-
-# Finding
-
-
-def test_results_are_found_in_files_and_folders_and_count_once(runs, monkeypatch):
-    assert {result.method for result in find_results([runs])} == {"coliags", "ablations/none"}
-    files = [runs / "one/eval/paper/result.json", runs / "others"]
-    assert [result.method for result in find_results(files)] == ["coliags", "ablations/none"]
-    write_result(runs / "copy.json", made_result(cost=CostRecord(device="the same", render_fps=3.0)))
-    monkeypatch.chdir(runs)
-    assert len(find_results([runs, runs / "one", runs.parent / "runs" / ".." / "runs" / "copy.json"])) == 2
-
-
-def test_what_is_missing_damaged_or_there_in_two_forms_is_named(runs, tmp_path):
-    (tmp_path / "empty").mkdir()
-    whole = (runs / "others/any name.json").read_text()
-    (tmp_path / "cut.json").write_text(whole[:900])
-    write_result(tmp_path / "copy.json", made_result({"test": made_set(psnr=(1.0, 2.0))}))
-    for name, match in (
-        ("empty", "holds no results"),
-        ("gone", "cannot read .*gone"),
-        ("cut.json", "is not JSON"),
-        ("copy.json", r"copy\.json.*results of the same run, and their values differ"),
-    ):
-        with pytest.raises(InputError, match=match):
-            find_results([runs, tmp_path / name])
-
-
-@pytest.mark.skipif(os.getuid() == 0, reason="root may read anything")
-def test_an_unreadable_file_is_named(runs):
-    (runs / "others/any name.json").chmod(0)
-    with pytest.raises(InputError, match="cannot be read"):
-        find_results([runs])
-
-
-# Commands
-
-
-def test_show_prints_means_and_costs(runs, capsys):
-    assert run("results", "show", runs / "one/eval/paper/result.json") == 0
-    printed = capsys.readouterr().out
-    for part in ("coliags on wall, seed 0, 60 steps", "30.75", "0123456789abcdef", "1 min 12 s", "1,234"):
-        assert part in printed
-    assert "processor time" not in printed, "it was not measured"
-    assert run("results", "show", runs) == 0
-    (runs.parent / "empty").mkdir()
-    assert "holds no results" in refused(capsys, "results", "show", runs.parent / "empty")
+def test_facts_tell_what_was_measured():
+    told = facts(made_result())
+    assert told["key"] == "0123456789abcdef" and told["training"] == "1 min 12 s" and told["gaussians"] == "1,234"
+    assert "processor time" not in told, "it was not measured"

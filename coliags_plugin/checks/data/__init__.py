@@ -1,1 +1,1 @@
-"""Consistency checks of a dataset's images, poses, depth and calibration: ``coliags data check``."""
+"""Consistency checks of a dataset's images, poses, depth and calibration: ``coliags check data``."""

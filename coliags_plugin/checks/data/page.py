@@ -1,4 +1,4 @@
-"""Page of the consistency checks: statistics, findings, pose hypotheses, and frames reprojected into each other."""
+"""Page of the consistency checks: statistics, findings, pose hypotheses, reprojected frames and the trajectory."""
 
 from __future__ import annotations
 
@@ -14,30 +14,32 @@ from coliags_plugin.checks.data.hypotheses import LEAST_CONFIDENCE, warp_image
 from coliags_plugin.core.images import sizes_text
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.reporting import model
-from coliags_plugin.reporting.colormaps import (
-    RGB_ERROR_LIMIT,
-    colorize_depth,
-    colorize_error,
-    depth_limits,
-    depth_scale_text,
-    rgb_error,
-)
+from coliags_plugin.reporting.colormaps import colorize_error, hatch, rgb_error
 from coliags_plugin.reporting.image_files import EncodedImage, eight_bit
 from coliags_plugin.reporting.numbers import counted, sentence, short_number
+from coliags_plugin.reporting.text_formats import page_text
 
-#: Number of pairs shown.
-_SHOWN = 3
+#: Number of pairs shown, and difference of the last colour, as a fraction of full scale.
+_SHOWN, _DIFFERENCE = 3, 0.2
+
+
+class ShownCheck(SceneCheck):
+    """A result that ``print`` and notebooks show as text."""
+
+    def __repr__(self) -> str:
+        return f"{page_text(check_page(self))}\n\n{verdict(self)}"
 
 
 def check_page(check: SceneCheck) -> model.Page:
     """Everything that the checks found; in the terminal without pictures, trajectory and origin of the data."""
-    name, unit, pairs = check.scene.name, check.scene.length_unit, check.pairs
+    name, unit = check.scene.name, check.scene.length_unit
+    pairs = check.pairs if check.agreement else []  # without depth, nothing is reprojected
     shown = pairs[:: max(1, len(pairs) // _SHOWN)][:_SHOWN]
     sections = [
         model.Section("Suspect", _bullets(check.findings)),
         model.Section("Undecided", _bullets(check.undecided)),
         model.Section("Agreement", _agreement(check)),
-        model.Section("Reprojected frames", [_pair_images(*pair, unit) for pair in shown], screen_only=True),
+        model.Section("Reprojected frames", [_pair_images(*pair) for pair in shown], screen_only=True),
         model.Section("Trajectory", [_trajectory(check.scene.video, unit)], screen_only=True),
         model.Section("Data", [model.record("Origin of the data", check.scene.provenance.record())], screen_only=True),
     ]
@@ -142,35 +144,17 @@ def _percent(share: float | None) -> str | None:
     return short_number(share, 100.0)
 
 
-def _pair_images(source: Frame, target: Frame, unit: str) -> model.Figures:
-    """The two images; the source warped into the target view and its difference; and the target's depth."""
-    images: list[tuple[np.ndarray | torch.Tensor, str]] = [(source.image, source.name), (target.image, target.name)]
-    if source.depth is not None and target.depth is not None:
-        painted, shown = warp_image(source, target)
-        canvas = torch.where(shown[..., None], painted, torch.full_like(painted, 0.5))
-        mixed = torch.where(_checkered(shown)[..., None], canvas, target.rgb.double())
-        images += [
-            (eight_bit(canvas), f"{target.name} warped from {source.name}"),
-            (eight_bit(mixed), "checkerboard of both: edges must be continuous"),
-            (
-                colorize_error(rgb_error(painted.float(), target.rgb, shown), RGB_ERROR_LIMIT),
-                "difference, black 0 to yellow 20 % of full scale",
-            ),
-        ]
-    if target.depth is not None:
-        limits = depth_limits([target.depth])
-        images.append((colorize_depth(target.depth, limits), f"z-depth, {depth_scale_text(limits, unit)}"))
-    return model.Figures(
-        [model.Image(EncodedImage.png(rgb), caption) for rgb, caption in images],
-        f"{source.name} and {target.name}",
-    )
-
-
-def _checkered(shown: torch.Tensor) -> torch.Tensor:
-    height, width = shown.shape
-    side = max(8, width // 10)
-    rows, columns = torch.arange(height)[:, None] // side, torch.arange(width)[None] // side
-    return ((rows + columns) % 2 == 0) & shown
+def _pair_images(source: Frame, target: Frame) -> model.Figures:
+    """A frame, its neighbour warped into it by depth and poses, and their difference; hatched where there is none."""
+    painted, shown = warp_image(source, target)
+    warped = np.where(shown[..., None], eight_bit(painted), hatch(*shown.shape))
+    difference = colorize_error(rgb_error(painted.float(), target.rgb, shown), _DIFFERENCE)
+    images: list[tuple[np.ndarray | torch.Tensor, str]] = [
+        (target.image, target.name),
+        (warped, f"{source.name} warped into it"),
+        (difference, f"difference, yellow from {_DIFFERENCE:.0%} of full scale on"),
+    ]
+    return model.Figures([model.Image(EncodedImage.png(rgb), caption) for rgb, caption in images])
 
 
 def _trajectory(video: Sequence[Frame], unit: str) -> model.Figures:
@@ -182,7 +166,7 @@ def _trajectory(video: Sequence[Frame], unit: str) -> model.Figures:
     return model.Figures(
         [
             model.Chart(along, "frame", position, "Camera centre along the video", legend=True),
-            model.Chart([model.Series("path", 3, z, x)], depth, f"x, {unit}", "From above"),
-            model.Chart([model.Series("path", 3, z, y)], depth, f"y, {unit}", "From the side"),
+            model.Chart([model.Series("path", 3, z, x)], depth, f"x, {unit}", "From above", equal_scales=True),
+            model.Chart([model.Series("path", 3, z, y)], depth, f"y, {unit}", "From the side", equal_scales=True),
         ]
     )

@@ -10,7 +10,7 @@ import numpy as np
 
 from coliags_plugin.comparison.report.study import Study, TestSet, grouped
 from coliags_plugin.engine.run_folder import RunFolder
-from coliags_plugin.reporting.model import Chart, Figures, Folded, Paragraph, Section, Series, Template
+from coliags_plugin.reporting.model import Chart, Figures, Folded, Paragraph, Series, Template
 from coliags_plugin.results.comparisons import common_scenes
 from coliags_plugin.results.record import ProfileRecord
 
@@ -29,7 +29,7 @@ _TRAINING_CURVES = {
 _Log = tuple[str, int, Mapping[str, np.ndarray]]
 
 
-def profile_section(study: Study) -> Section:
+def profiles(study: Study) -> Folded:
     """Errors against distance and angle; without blocks where no result has profiles."""
     explanation = Paragraph(
         "Over the pixels with known depth, all frames and scenes together: PSNR from the mean squared colour error, "
@@ -38,7 +38,7 @@ def profile_section(study: Study) -> Section:
     )
     charts = {test_set.title: _profile_charts(test_set) for test_set in study.test_sets}
     figures = [Figures(group, title, study.methods) for title, group in charts.items() if group]
-    return Section("Error against distance and angle", [explanation, *figures] if figures else [], screen_only=True)
+    return Folded("Error against distance and angle", [explanation, *figures] if figures else [])
 
 
 def _profile_charts(test_set: TestSet) -> list[Chart]:
@@ -80,7 +80,7 @@ def _profile_line(method: str, style: int, profiles: Sequence[ProfileRecord], of
     return Series(method, style, ((edges[:-1] + edges[1:]) / 2.0)[enough].tolist(), shown[enough].tolist())
 
 
-def training_section(study: Study) -> Section:
+def training(study: Study) -> Folded:
     """Curves of every scene against steps and seconds; says so where there is no log."""
     logs: dict[str, list[_Log]] = {}
     for style, runs in enumerate(study.by_method.values()):
@@ -89,7 +89,7 @@ def training_section(study: Study) -> Section:
                 logs.setdefault(run.scene, []).append((run.method, style, columns))
     if not logs:
         text = "No training log: only results files are here, or runs without metrics.jsonl."
-        return Section("Training", [Paragraph(text)], screen_only=True)
+        return Folded("Training", [Paragraph(text)])
     hint = (
         f"Curves of more than {_MOST_POINTS} logged steps are means over intervals. There is one for each seed. Each "
         "method has a loss of its own: compare the shapes of the curves, not their levels."
@@ -101,7 +101,7 @@ def training_section(study: Study) -> Section:
     ]
     folded[0] = replace(folded[0], is_open=True)
     shown = folded if len(folded) > 1 else folded[0].blocks
-    return Section("Training", [Template("curves.html"), Paragraph(hint), *shown], screen_only=True)
+    return Folded("Training", [Template("curves.html"), Paragraph(hint), *shown])
 
 
 def _training_charts(logs: Sequence[_Log]) -> list[Chart]:

@@ -119,13 +119,13 @@ def means_table(
 ) -> Table:
     """Mean of every metric over the scenes that all methods have, or over one scene, with its standard deviation.
 
-    Stars are by metric and method; published numbers stand below our means over all scenes.
+    Stars are by metric and method. Means over all scenes have notes, and published numbers below them.
     """
     published, source = published_for(test_set) if scene is None else ({}, "")
     scenes, marks = test_set.scenes if scene is None else [scene], stars or {}
-    cells = {column.key: _metric_cells(test_set, column, scenes, marks.get(column.key, {})) for column in columns}
+    cells = {column.key: _metric_cells(test_set, column, scene, marks.get(column.key, {})) for column in columns}
     notes = [] if scene is not None else _summary_notes(test_set, columns)
-    if any(cell.spread for column in cells.values() for cell in column):
+    if scene is None and any(cell.spread for column in cells.values() for cell in column):
         notes.append(f"± standard deviation over {'scenes' if len(scenes) > 1 else 'seeds'}")
     if any(mark for by_method in marks.values() for mark in by_method.values()):
         levels = ", ".join(f"{'*' * (index + 1)} p < {f'{level:g}'[1:]}" for index, level in enumerate(LEVELS))
@@ -145,27 +145,25 @@ def means_table(
     )
 
 
-def _metric_cells(
-    test_set: TestSet, column: Column, scenes: Sequence[str], stars: Mapping[str, str]
-) -> list[TableCell]:
-    values = {
-        method: {scene: seeds for scene, seeds in by_scene.items() if scene in scenes}
-        for method, by_scene in test_set.values(column.key).items()
-    }
+def _metric_cells(test_set: TestSet, column: Column, scene: str | None, stars: Mapping[str, str]) -> list[TableCell]:
+    """Cells of one column, by one scene or, with footnotes, all."""
+    values = test_set.values(column.key)
+    if scene is not None:
+        values = {method: {scene: by_scene[scene]} if scene in by_scene else {} for method, by_scene in values.items()}
     means = spreads(values).values()
     over = [each.over_scenes if each.scenes > 1 else each.over_seeds for each in means]
     cells = ranked_cells([each.mean for each in means], column.unit, column.direction, over)
+    if scene is not None:
+        return cells
     return [
-        replace(cell, stars=stars.get(method, ""), note=_footnote(test_set, column, method, values, scenes))
+        replace(cell, stars=stars.get(method, ""), note=_footnote(test_set, column, method, values))
         for method, cell in zip(test_set.study.methods, cells, strict=True)
     ]
 
 
-def _footnote(
-    test_set: TestSet, column: Column, method: str, values: Mapping[str, BySeed], scenes: Sequence[str]
-) -> str:
+def _footnote(test_set: TestSet, column: Column, method: str, values: Mapping[str, BySeed]) -> str:
     """Footnote of a mean over scenes: why it is missing, or what it leaves out; empty where it leaves out nothing."""
-    evaluated = [scene for scene in scenes if test_set.evaluated(method, scene)]
+    evaluated = [scene for scene in test_set.scenes if test_set.evaluated(method, scene)]
     lacking, shared = [scene for scene in evaluated if scene not in values[method]], shared_scenes(values)
     if not evaluated:
         return f"{method}: no result"
@@ -195,10 +193,11 @@ def _summary_notes(test_set: TestSet, columns: Sequence[Column]) -> list[str]:
         lambda column: tuple(scene for scene in test_set.scenes if scene not in shared_scenes(values[column.key])),
     )
     empty = grouped(
-        [column for column in lacking if not column.shown],
+        [column for column in lacking if not column.shown and column.key in {*DEFAULT_COLUMNS, *_BEYOND_THE_PATH}],
         lambda column: test_set.reason(test_set.study.methods[0], column.key),
     )
-    notes = [f"Not shown, without values: {_titles(group)}: {reason}" for reason, group in empty.items()]
+    without = "; ".join(f"{_titles(group)} ({reason})" for reason, group in empty.items())
+    notes = [f"Not shown, without values: {without}"] if without else []
     for scenes, group in missing.items():
         if scenes:
             notes.append(
@@ -317,7 +316,8 @@ EXPLANATION = (
     "first. 95 % t interval: of the mean lead over scenes, by Student's t. Smallest p: what the two-sided Wilcoxon "
     "signed-rank test of so many scenes can give. Holm: adjusted for all rivals that were planned or given. "
     "Cohen's d: of paired samples, the mean lead over its standard deviation. Rank-biserial: matched-pairs "
-    "correlation, 1 where the reference is better on every scene."
+    "correlation, 1 where the reference is better on every scene. Missing: no scene in common, fewer than "
+    f"{FEWEST_SCENES} of them for a test, or leads that are all equal."
 )
 _SMALLEST_PRINTED = 1e-4
 
@@ -379,22 +379,18 @@ def lead_table(test_set: TestSet, column: Column, compared: Sequence[RivalCompar
     decimals = column_decimals(column.unit, [row.lead for row in compared])
     rows = []
     for row in compared:
-        lead = TableCell(note="no scene in common")
-        if row.lead is not None:
-            lead = TableCell(_signed(row.lead, decimals), row.lead)
         cells: dict[str, Value | TableCell] = {
             "over": TableCell(row.rival, style=study.methods.index(row.rival)),
             "scenes": len(row.scenes),
-            "lead": lead,
+            "lead": None if row.lead is None else TableCell(_signed(row.lead, decimals), row.lead),
             "better": TableCell(f"{row.better_on} of {len(row.scenes)}", row.better_on),
-            **dict.fromkeys(("interval", *_TESTS), TableCell(note=f"fewer than {FEWEST_SCENES} scenes in common")),
         }
         if row.tests is not None:
             ends = row.tests.interval
             cells["interval"] = TableCell(" to ".join(_signed(end, decimals) for end in ends), ends[0])
             for key, (_, text, value) in _TESTS.items():
                 p = value(row)
-                cells[key] = TableCell(note="all differences are equal") if p is None else TableCell(text(p), p)
+                cells[key] = None if p is None else TableCell(text(p), p)
             holm, marks = row.tests.wilcoxon_holm, row.stars if study.is_decided(reference, column.key) else ""
             cells["wilcoxon_holm"] = TableCell(p_text(holm), holm, stars=marks)
         rows.append(cells)

@@ -13,6 +13,7 @@ from coliags_plugin.core.errors import InputError, check_name
 from coliags_plugin.core.json_files import read_json
 from coliags_plugin.core.provenance import held_out_uses
 from coliags_plugin.reporting.model import leaves
+from coliags_plugin.reporting.numbers import counted
 from coliags_plugin.results.comparisons import BySeed
 from coliags_plugin.results.hashing import training_key
 from coliags_plugin.results.reading import RESULT_FILE, read_result
@@ -151,11 +152,12 @@ class TestSet:
         return {frame: sum(values) / len(values) for frame, values in by_frame.items()}
 
     def reason(self, method: str, metric: str, scene: str | None = None) -> str:
-        """Reason why a metric is unavailable, as the first result without it says."""
+        """Reason why a metric is unavailable, as the first result without it says, but for what to do about it."""
         records = [record for _, record in self.evaluated(method, scene)]
         names = (metric, metric.removesuffix(SEEN_SUFFIX))
         reasons = (record.reasons.get(name) for record in records for name in names)
-        return next(filter(None, reasons), "no reason was recorded" if records else "no result")
+        reason = next(filter(None, reasons), "no reason was recorded" if records else "no result")
+        return reason.partition(". ")[0]
 
 
 @dataclass(frozen=True)
@@ -233,7 +235,9 @@ def read_study(paths: Sequence[Path], protocol: str = "paper", methods: Sequence
     plans: list[ComparisonPlan] = []
     for path in paths:
         if not path.is_dir():
-            runs.append(_read_file(path, path.stem))
+            is_in_run = path.match(f"eval/*/{RESULT_FILE}") and (path.parent / "renders").is_dir()
+            run = path.parents[2] if is_in_run else None
+            runs.append(_read_file(path, path.stem if run is None else run.resolve().name, run))
         elif (plan := read_plan(path)) is not None:
             plans.append(plan)
             runs += _read_comparison(path, plan, protocol, missing)
@@ -353,7 +357,8 @@ def refuse_incomparable(runs: Sequence[StudyRun]) -> None:
     for same_place in grouped(runs, lambda run: run.place).values():
         for run in same_place:
             _refuse_other_data(same_place[0], run)
-    places = {name: {run.place for run in group} for name, group in grouped(runs, lambda run: run.method).items()}
+    by_method = grouped(runs, lambda run: run.method)
+    places = {name: {run.place for run in group} for name, group in by_method.items()}
     for method, covered in places.items():
         others = {place for other, theirs in places.items() if other != method for place in theirs}
         if others and not covered & others:
@@ -363,8 +368,26 @@ def refuse_incomparable(runs: Sequence[StudyRun]) -> None:
             raise InputError(
                 "no scene and split in common: {} has {}, the other methods have {}".format(method, *names),
                 "methods on the same scenes and splits",
-                "Write one report for each scene, or train on the same split",
+                _against_truth(by_method[method], [run for run in runs if run.method != method])
+                or "Write one report for each scene, or train on the same split",
             )
+
+
+def _against_truth(runs: Sequence[StudyRun], others: Sequence[StudyRun]) -> str:
+    """Hint to evaluate a run against the truth that the others have; empty where it is no version of their scenes."""
+
+    def frames(run: StudyRun) -> object:
+        return run.result.scene.model_dump(exclude={"name", "fingerprint"})
+
+    estimated = [run for run in (*runs, *others) if run.data.get("depth_is_estimated")]
+    versions = estimated or [run for run in runs for other in others if frames(run) == frames(other)]
+    if not versions:
+        return ""
+    run, folder = versions[0], versions[0].run or "RUN"
+    return (
+        f"If {run.scene} is a version of their scene: run `coliags eval {folder} --truth SCENE`, SCENE being that with "
+        f"the true depth, and report {folder}/eval/{run.result.protocol.name}{TRUTH_SUFFIX}/{RESULT_FILE} in its place"
+    )
 
 
 def _refuse_other_data(first: StudyRun, other: StudyRun) -> None:
@@ -392,7 +415,7 @@ def _refuse_other_data(first: StudyRun, other: StudyRun) -> None:
             raise InputError(
                 f"{both}: their true images or depths of set '{name}' differ",
                 "runs of the same data",
-                "Train on one copy",
+                _against_truth([first], [other]),
             )
 
 
@@ -427,9 +450,12 @@ def cautions(study: Study) -> list[str]:
     treated = {name: runs[0].result.provenance.get("untrained_views") or {} for name, runs in study.by_method.items()}
     if any(each != treated[study.methods[0]] for each in treated.values()):
         texts += [f"{method}, {name}: {text}." for method, each in treated.items() for name, text in each.items()]
+    sets = [(run, name, record) for run in study.runs for name, record in run.result.sets.items()]
+    if warned := [each for each in sets if each[-1].transparency_warning]:
+        run, name, worst = max(warned, key=lambda each: (each[-1].blank, each[-1].transparent or 0.0))
+        others = f" At most as many in {counted(len(warned) - 1, 'more set')} of views." if len(warned) > 1 else ""
+        texts.append(f"{run.method} on {run.scene}, set {name}: {worst.transparency_warning}.{others}")
     for run in study.runs:
-        warnings = {name: record.transparency_warning for name, record in run.result.sets.items()}
-        texts += [f"{run.method} on {run.scene}, set {name}: {text}." for name, text in warnings.items() if text]
         uses = held_out_uses(run.result.provenance.get("held_out_used", {}))
         texts += [f"{run.scene}, split {run.place[1]}: {use}." for use in uses]
     differing: dict[str, None] = {}
@@ -438,7 +464,7 @@ def cautions(study: Study) -> list[str]:
         keys = dict.fromkeys(key for each in data for key in each)
         differing |= {key: None for key in keys if any(each.get(key) != data[0].get(key) for each in data)}
     if differing:
-        texts.append(f"Runs of one scene record different data, see Provenance: {', '.join(differing)}.")
+        texts.append(f"Runs of one scene record different data: {', '.join(differing)}.")
     return list(dict.fromkeys(texts))
 
 

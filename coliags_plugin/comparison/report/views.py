@@ -1,9 +1,9 @@
-"""Held-out views: a slider between two methods, and every method beside the truth, with errors on one scale."""
+"""Held-out views: a slider between two methods, and every method beside the truth, each set on scales of its own."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,12 +20,13 @@ from coliags_plugin.reporting.colormaps import (
     colorize_error,
     depth_error,
     depth_limits,
+    error_limit,
     hatch,
     rgb_error,
 )
 from coliags_plugin.reporting.image_files import EncodedImage, read_depth_tiff
 from coliags_plugin.reporting.model import Block, ColorBar, Paragraph, Section, Template
-from coliags_plugin.reporting.numbers import column_decimals, number_text, round_up, unit_text
+from coliags_plugin.reporting.numbers import column_decimals, number_text, unit_text
 
 #: Wider images are reduced by an integer factor, to limit the size of the report, px.
 _WIDEST = 640
@@ -34,13 +35,8 @@ Rgb = UInt8[np.ndarray, "H W 3"]
 Map = Float[np.ndarray, "H W"]
 #: Metrics whose worst frame is shown as well.
 _WORST_OF = ("psnr", "depth_mse")
-#: Percentile of the errors shown at which the common scale ends, before rounding up.
-_SCALE_PERCENTILE = 95.0
-_SMALLEST_SCALE = 1e-6
-#: Errors of an image that enter the percentile.
-_SAMPLED = 20_000
 #: Metrics shown under an image, where available; the mean depth error stands for the mean squared one.
-_CAPTION_METRICS = ("psnr", "psnr_seen", "ssim", "ssim_seen", "depth_mae", "depth_mae_seen", "depth_mse")
+_CAPTION_METRICS = ("psnr", "ssim", "depth_mae", "depth_mse")
 
 #: A picture with its alternative text, or what is said instead of one.
 _Tile = tuple[EncodedImage | None, str]
@@ -54,10 +50,11 @@ class _Frame:
     scene: str
     position: int  # its index among the frames of the set
     name: str
+    label: str  # what the page calls it
     why: str  # why it is shown; empty for one of those spread along the video
 
 
-def _choose_frames(study: Study, reference: str, count: int) -> Iterator[_Frame]:
+def _choose_frames(study: Study, reference: str, count: int, label: Callable[[str], str]) -> Iterator[_Frame]:
     """Frames of every scene and set: ``count`` spread evenly, first and last included, and the reference's worst."""
     for scene in study.scenes:
         for test_set in study.test_sets:
@@ -70,7 +67,7 @@ def _choose_frames(study: Study, reference: str, count: int) -> Iterator[_Frame]
                     worst_by.setdefault(names.index(worst), []).append(metric_title(metric))
             for position in sorted({*evenly(len(names), count), *worst_by}):
                 why = f"worst {' and '.join(worst_by[position])} of {reference}" if position in worst_by else ""
-                yield _Frame(test_set, scene, position, names[position], why)
+                yield _Frame(test_set, scene, position, names[position], label(names[position]), why)
 
 
 def evenly(length: int, count: int) -> list[int]:
@@ -162,7 +159,7 @@ def view_section(study: Study, reference: str, count: int, label: Callable[[str]
     if count < 1:
         raise InputError(f"{count} frames to show", "at least one")
     title, views = "Held-out views", list[_View]()
-    for frame in _choose_frames(study, reference, count):
+    for frame in _choose_frames(study, reference, count, label):
         seeds = (
             [run for run, _ in frame.test_set.evaluated(method, frame.scene) if run.run] for method in study.methods
         )
@@ -171,78 +168,59 @@ def view_section(study: Study, reference: str, count: int, label: Callable[[str]
     if not views:
         text = "No images: only results files are here, without the run folders."
         return Section(title, [Paragraph(text)], screen_only=True)
-    error_ends, limits_of, unit = _error_ends(views), _depth_limits(views), study.length_unit
-    bars = [
-        ColorBar(
-            (0.0, end), unit if kind == "depth" else "levels of 255", "error", f"|{kind} error|", f"{kind}-error-scale"
-        )
-        for kind, end in error_ends.items()
-    ]
-    depth_bars = {
-        scene: ColorBar(limits, unit, "depth", "depth", f"depth-scale-{index}")
-        for index, (scene, limits) in enumerate(limits_of.items())
-    }
-    values = {
-        "bars": bars,
-        "hatch": EncodedImage.webp(hatch(14, 34)) if limits_of else None,
-        "reference": reference,
-        "scenes": [
-            (
-                scene,
-                depth_bars.get(scene),
-                [
-                    (test_set.title, [_template_values(view, error_ends, limits_of.get(scene), label) for view in same])
-                    for test_set, same in grouped(in_scene, lambda view: view.frame.test_set).items()
-                ],
-            )
-            for scene, in_scene in grouped(views, lambda view: view.frame.scene).items()
-        ],
-    }
+    in_sets = grouped(views, lambda view: (view.frame.scene, view.frame.test_set))
+    values = {"reference": reference, "sets": [_set_values(same, index) for index, same in enumerate(in_sets.values())]}
     factor = max(_reduction(run.result.scene.size[0]) for run in study.runs)
     explanation = (
-        f"Frames spread along each video, and the worst of {reference}. With each rendering, its absolute error, of "
-        "depth, or where there is no true depth of colour (the mean of red, green and blue), and the expected depth, "
-        "hatched where alpha is below 0.5. One scale of errors serves this page, and one of depth, logarithmic, each "
-        "scene. That of errors ends at the "
-        f"smallest 1, 2 or 5 times a power of ten below which {_SCALE_PERCENTILE:.0f} % of all errors shown lie. "
-        "Errors beyond it, and missing depth where the truth has one, take its last colour. Of several seeds, the "
-        "first is shown. Photographs are JPEG here; the run folders keep them as PNG."
-    ) + (f" Images are shown at 1/{factor} of their size." if factor > 1 else "")
+        f"Frames spread along each video, and the worst of {reference}. Below each rendering is its absolute error, of "
+        "depth, or without true depth of colour (the mean of red, green and blue), then its expected depth. The scales "
+        "of a set are the same for all its methods and frames: of errors by square roots, of depth logarithmic."
+    )
+    if len({run.result.seed for run in study.runs}) > 1:
+        explanation += " Of several seeds, the first is shown."
+    if factor > 1:
+        explanation += f" Images are shown at 1/{factor} of their size."
     blocks: list[Block] = [Paragraph(explanation), Template("views.html", values)]
     return Section(title, blocks, screen_only=True, name="views")
 
 
-def _error_ends(views: Sequence[_View]) -> dict[str, float]:
-    """Ends of the scales of errors by their kinds."""
-    return {
-        kind: error_limit([each.error for view in same for each in view.renderings if each.error is not None])
+def _set_values(views: Sequence[_View], index: int) -> dict[str, Any]:
+    """Values of the views of one scene and test set for the template, with the scales that they share.
+
+    The limits of depth are those of the true depths, or of the expected ones where there is no true depth.
+    """
+    frame, unit = views[0].frame, views[0].frame.test_set.study.length_unit
+    ends = {
+        kind: error_limit(each.error for view in same for each in view.renderings if each.error is not None)
         for kind, same in grouped(views, lambda view: view.kind).items()
+    }
+    bars = []
+    for kind, end in ends.items():
+        of = unit if kind == "depth" else "levels of 255"
+        bars.append(ColorBar((0.0, end), of, "error", f"|{kind} error|", f"{kind}-error-scale-{index}"))
+    depths = [view.true_depth for view in views if view.true_depth is not None]
+    depths = depths or [each.expected for view in views for each in view.renderings if each.expected is not None]
+    limits = depth_limits(depths)
+    if depths:
+        bars.append(ColorBar(limits, unit, "depth", "depth", f"depth-scale-{index}"))
+    return {
+        "title": f"{frame.scene} · {frame.test_set.title}",
+        "bars": bars,
+        "hatch": EncodedImage.webp(hatch(14, 34)) if depths else None,
+        "views": [_template_values(view, ends[view.kind], limits) for view in views],
     }
 
 
-def _depth_limits(views: Sequence[_View]) -> dict[str, tuple[float, float]]:
-    """Limits of depth by scene: of the true depths, or where there are none, of the expected ones."""
-    limits = {}
-    for scene, same in grouped(views, lambda view: view.frame.scene).items():
-        depths = [view.true_depth for view in same if view.true_depth is not None]
-        depths = depths or [each.expected for view in same for each in view.renderings if each.expected is not None]
-        if depths:
-            limits[scene] = depth_limits(depths)
-    return limits
-
-
-def _template_values(
-    view: _View, error_ends: Mapping[str, float], limits: tuple[float, float] | None, label: Callable[[str], str]
-) -> dict[str, Any]:
+def _template_values(view: _View, error_end: float, limits: tuple[float, float]) -> dict[str, Any]:
     """Values of a view for the template."""
-    frame, where = view.frame, label(view.frame.name)
+    frame, where = view.frame, view.frame.label
     study, test_set = frame.test_set.study, frame.test_set
     truth = EncodedImage.jpeg(view.truth)
     tiles: list[_Tile] = [(truth, f"{where}, true image")]
     caption = []
-    if view.true_depth is not None and limits is not None:
+    if view.true_depth is not None:
         tiles.append((EncodedImage.webp(colorize_depth(view.true_depth, limits)), f"{where}, true depth"))
-        caption = ["above: camera image", "below: true depth"]
+        caption = ["image and true depth"]
     elif not view.in_row:
         tiles.append((None, "no true depth"))
     cells: list[tuple[str, int | None, list[_Tile], list[str]]] = [("truth", None, tiles, caption)]
@@ -252,9 +230,9 @@ def _template_values(
         if rendering.error is None:
             tiles.append((None, "no depth to compare"))
         else:
-            drawn = colorize_error(rendering.error, error_ends[view.kind])
+            drawn = colorize_error(rendering.error, error_end)
             tiles.append((EncodedImage.webp(drawn), f"{where}, absolute {view.kind} error of {name}"))
-            if rendering.expected is not None and limits is not None:
+            if rendering.expected is not None:
                 drawn = colorize_depth(rendering.expected, limits, hatched=True)
                 tiles.append((EncodedImage.webp(drawn), f"{where}, expected depth of {name}"))
         cells.append((name, study.methods.index(name), tiles, _caption(frame, rendering.run)))
@@ -278,11 +256,3 @@ def _caption(frame: _Frame, run: StudyRun) -> list[str]:
             number = number_text(value, column_decimals(unit, [value]))
             texts.append(f"{metric_title(name)} {number} {unit_text(unit)}".rstrip())
     return texts or ["no metrics for this frame"]
-
-
-def error_limit(errors: Sequence[np.ndarray]) -> float:
-    """The 95th percentile of all finite errors together, rounded up to 1, 2 or 5 times a power of ten."""
-    samples = [values.ravel()[:: math.ceil(values.size / _SAMPLED) or 1] for values in errors]
-    pooled = np.concatenate([*samples, np.zeros(0)])
-    finite = pooled[np.isfinite(pooled)]
-    return round_up(max(float(np.percentile(finite, _SCALE_PERCENTILE)), _SMALLEST_SCALE)) if finite.size else 1.0

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 
 from coliags_plugin.config.options import ExportOptions, ImportOptions
-from coliags_plugin.contracts import Comparison, GaussianField
+from coliags_plugin.contracts import GaussianField
 from coliags_plugin.core.errors import InputError, check_name
 from coliags_plugin.core.files import atomic_folder, file_sha256, refuse_existing, write_json
 from coliags_plugin.core.lamps import HeldLight
@@ -34,9 +34,17 @@ from coliags_plugin.reporting.numbers import counted
 log = logging.getLogger(__name__)
 
 #: Of the record beside a file; incremented when a reader of the older version would misread it.
-RECORD_VERSION = 1
+RECORD_VERSION = 2
 #: Metrics of protocols that are compared.
 _METRICS = ("psnr", "depth_mse")
+#: What each light is in a file (:data:`~coliags_plugin.engine.held_light.LIGHTS`).
+_LIGHTS = {
+    "recorded": "the lamp of every training camera, averaged",
+    "mean": "a lamp that stays at the mean training camera",
+    "flattened": "the same everywhere",
+}
+#: Warned of where the light alone costs more, against the recorded frames, dB.
+_MUCH = 1.0
 #: Methods of imported Gaussians, by the number of their scales.
 _METHODS = {3: "3dgs", 2: "2dgs"}
 #: Views, approximately, of which an imported file must show something.
@@ -52,11 +60,20 @@ class Exported:
     record: Mapping[str, Any]
 
     @property
+    def measured(self) -> Mapping[str, Mapping[str, Any]]:
+        """What :func:`measure` found, by test set; empty where nothing was measured."""
+        return self.record["measured"] or {}
+
+    @property
     def text(self) -> str:
-        """Number of Gaussians, file size, and PSNR beside the run's, in one line of text."""
-        record = self.record
+        """Number of Gaussians and file size; PSNR as viewers show the file, and in the baked light. Several lines."""
+        record, baking = self.record, self.record["baking"] or {}
         text = f"{self.file.name}: {record['gaussians']:,} Gaussians, {record['file']['bytes'] / 1e6:.1f} MB"
-        return "; ".join([text, *cost_lines(record["cost"] or {})])
+        lines = [text, *psnr_lines(self.measured, "recorded", "in a viewer, against the recorded frames")]
+        if light := baking.get("light"):
+            said = f"in the baked light, {light['name']} ({_LIGHTS[light['name']]})"
+            lines += psnr_lines(self.measured, "in_light", said)
+        return "\n".join(lines)
 
 
 def export_run(trained: TrainedRun, options: ExportOptions) -> list[Exported]:
@@ -65,7 +82,7 @@ def export_run(trained: TrainedRun, options: ExportOptions) -> list[Exported]:
     Explicit Gaussians are written as they are. Surfels, and Gaussians that a field decodes for each view, or lights,
     are baked (:func:`~coliags_plugin.export.baking.baking.bake`) once, under a light that is held, given by its name;
     it has no effect where colours know no lamp. With ``measure``, each file is compared with the run on the held-out
-    views.
+    views, with a warning where the baked light looks much different from the recorded one.
     """
     scene, formats = trained.scene, options.formats
     file = options.output or trained.run.path / "export" / f"{trained.provenance['scene']['name']}.{formats[0]}"
@@ -101,12 +118,27 @@ def export_run(trained: TrainedRun, options: ExportOptions) -> list[Exported]:
                 "step": trained.step,
             },
             "baking": {"light": light_facts(options.light, field, light), **facts} if facts else None,
-            "cost": export_cost(trained, stored, light if field.knows_lamp else None) if options.measure else None,
+            "measured": measure(trained, stored, light if field.knows_lamp else None) if options.measure else None,
             "software": software(),
         }
         write_json(_record_file(output), record)
         exported.append(Exported(output, _record_file(output), record))
+    _warn_of_light(exported[0], options.light if field.knows_lamp else "recorded")
     return exported
+
+
+def _warn_of_light(exported: Exported, light: str) -> None:
+    """Warn where the brightness of a file differs much from that of the recorded frames."""
+    pairs = [(test_set["in_light"], test_set["recorded"]) for test_set in exported.measured.values()]
+    lost = max((held["psnr"] - recorded["psnr"] for held, recorded in pairs if "psnr" in recorded), default=0.0)
+    cause, nearer = "frames have no gains", ""
+    if light != "recorded":
+        cause, nearer = "the lamp that moved with the camera is baked", ", and `light=recorded` comes nearer"
+    if lost > _MUCH:
+        log.warning(
+            "%s: brightness differs from the video (%.1f dB), as %s; `coliags view RUN` shows the run itself%s",
+            *(exported.file.name, lost, cause, nearer),
+        )
 
 
 def light_facts(name: str, field: GaussianField, light: HeldLight | None) -> dict[str, Any] | None:
@@ -133,28 +165,27 @@ def _gaussian_field(trained: TrainedRun) -> GaussianField:
         )
     if trained.model.view_modules:
         names = ", ".join(trained.model.view_modules)
-        log.warning("view modules are no part of a file of Gaussians and are left out: %s", names)
+        log.warning("what view modules do to single frames is no part of a file of Gaussians: %s", names)
     return field
 
 
-def export_cost(trained: TrainedRun, cloud: SplatCloud, light: HeldLight | None) -> dict[str, dict[str, Any]]:
-    """Compare a cloud with its run on every held-out view, by the run's protocol; means per test set.
+def measure(trained: TrainedRun, cloud: SplatCloud, light: HeldLight | None) -> dict[str, dict[str, Any]]:
+    """Compare a cloud with its run on every held-out frame, by the run's protocol; means per test set.
 
-    Views are where the run's view modules place them.
-
-    Where a lamp moves with the camera, no cloud can show recorded frames: it is compared under the held light, with the
-    frames brought to that light: the run's own render there, plus what the run's render misses of the frame. By that
-    the run's PSNR is that of its evaluation, and the cloud's differs by baking alone.
+    Against the frames as recorded, the cloud's values are those that an import of its file evaluates to: it has no
+    lamp that moves, and no frame's own gain. In the held light it is compared with the frames brought to it: the run's
+    own render there, from where the run's view modules place the view, plus what the run's render misses of the
+    frame. By that the run's PSNR is that of its evaluation, and the cloud's differs by baking alone.
 
     Returns:
-        By test set: ``frames`` (their number), ``run`` and ``export`` (means by metric), ``cost`` (dB that PSNR falls,
-        mm^2 that the squared error of depth rises), ``psnr_between`` (of the cloud against the run under that light)
-        and ``psnr_recorded`` (of the cloud against the frames as recorded).
+        By test set: ``frames``, their number; ``run``, ``recorded`` and ``in_light``, means by metric (``psnr``, dB,
+        and ``depth_mse``, mm^2) of the run, and of the cloud against frames as recorded and in the light; and
+        ``psnr_between``, dB, of the cloud against the run in that light.
     """
     scorer = Scorer(trained.config.protocol, _METRICS)
     baked = model_of_gaussians(field_of_cloud(cloud), trained)
     sets = {name: frames for name, frames in trained.scene.test_sets.items() if frames}
-    costs, count = {}, 0
+    measured, count = {}, 0
     with ProgressReport("compare with the run", sum(map(len, sets.values()))) as progress:
         for name, frames in sets.items():
             rows = []
@@ -162,26 +193,18 @@ def export_cost(trained: TrainedRun, cloud: SplatCloud, light: HeldLight | None)
                 rows.append(_scores(trained, scorer, baked, frame.to(trained.device), light))
                 progress.update(count := count + 1)
             means = {part: _means([row[part] for row in rows]) for part in rows[0]}
-            run, export = means["run"], means["export"]
-            both = [metric for metric in run if metric in export]
-            costs[name] = {
-                "frames": len(rows),
-                "run": run,
-                "export": export,
-                "cost": {each: (-1.0 if each == "psnr" else 1.0) * (export[each] - run[each]) for each in both},
-                "psnr_between": means["between"].get("psnr"),
-                "psnr_recorded": means["recorded"].get("psnr"),
-            }
-    return costs
+            between = means.pop("between").get("psnr")
+            measured[name] = {"frames": len(rows), **means, "psnr_between": between}
+    return measured
 
 
-def cost_lines(cost: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """PSNR of exported Gaussians and of their run, one text for each test set that has it."""
+def psnr_lines(measured: Mapping[str, Mapping[str, Any]], part: str, said: str) -> list[str]:
+    """PSNR of what :func:`measure` returns under ``part``, beside the run's: a line for each test set that has it."""
     return [
-        f"{of_set['export']['psnr']:.2f} dB in that light on {counted(of_set['frames'], 'held-out frame')} ({name}), "
-        f"the run {of_set['run']['psnr']:.2f} dB"
-        for name, of_set in cost.items()
-        if "psnr" in of_set["export"]
+        f"{said}: {test_set[part]['psnr']:.2f} dB on {counted(test_set['frames'], 'held-out frame')} ({name}), "
+        f"the run {test_set['run']['psnr']:.2f} dB"
+        for name, test_set in measured.items()
+        if "psnr" in test_set[part]
     ]
 
 
@@ -189,21 +212,18 @@ def cost_lines(cost: Mapping[str, Mapping[str, Any]]) -> list[str]:
 def _scores(
     trained: TrainedRun, scorer: Scorer, baked: Model, frame: Frame, light: HeldLight | None
 ) -> dict[str, dict[str, float]]:
-    """Values by metric, of ``run``, ``export``, ``between`` and ``recorded``."""
+    """Values by metric, of ``run``, ``recorded``, ``in_light`` and ``between``."""
     run = scorer.protocol.compare(scorer.render(trained.model, frame), frame)
+    recorded = scorer.protocol.compare(scorer.render(baked, frame), frame)
     frame = replace(frame, camera=adjusted_camera(trained, frame))
     export = scorer.protocol.compare(scorer.render(baked, frame), frame)
     relit = scorer.protocol.compare(render_held(trained.model, frame.camera, light, scorer.wants), frame)
     at_light = relit.rgb + (run.true_rgb - run.rgb)
-
-    def values(comparison: Comparison, true_rgb: torch.Tensor) -> dict[str, float]:
-        return scorer.score(replace(comparison, true_rgb=true_rgb)).values
-
     return {
-        "run": values(run, run.true_rgb),
-        "export": values(export, at_light),
-        "between": values(export, relit.rgb),
-        "recorded": values(export, run.true_rgb),
+        "run": scorer.score(run).values,
+        "recorded": scorer.score(recorded).values,
+        "in_light": scorer.score(replace(export, true_rgb=at_light)).values,
+        "between": scorer.score(replace(export, true_rgb=relit.rgb)).values,
     }
 
 

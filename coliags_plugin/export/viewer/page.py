@@ -29,7 +29,7 @@ from coliags_plugin.engine.held_light import held_light
 from coliags_plugin.engine.trained import TrainedRun
 from coliags_plugin.export.baking.baking import bake
 from coliags_plugin.export.baking.distillation import adjusted_camera, best_frame
-from coliags_plugin.export.baking.exporting import cost_lines, export_cost, light_facts
+from coliags_plugin.export.baking.exporting import light_facts, measure, psnr_lines
 from coliags_plugin.export.splats.cloud import SplatCloud, field_of_cloud
 from coliags_plugin.export.splats.formats import read_spz, write_spz
 from coliags_plugin.fields.explicit_gaussians import FARTHEST
@@ -257,12 +257,16 @@ def _page_of_gaussians(
     splats, baking = bake(trained, lamp, options.seconds, (largest - empty) // _BYTES, 0, attenuated, most_steps)
     first = best_frame(field_of_cloud(splats), trained, lamp)
     layer, drawn = Layer.of_cloud(splats)
-    cost = export_cost(trained, drawn, lamp if field.knows_lamp else None)
+    measured = measure(trained, drawn, lamp if field.knows_lamp else None)
     parts = [f"step {trained.step}", f"{len(splats):,} of {baking['visible']:,} Gaussians"]
     if field.knows_lamp:
         parts.append(f"{light} light")
-    text = "; ".join([*parts, *cost_lines(cost)])
-    facts = {"gaussians": len(splats), "baking": {"light": light_facts(light, field, lamp), **baking}, "cost": cost}
+    text = "; ".join([*parts, *psnr_lines(measured, "in_light", "in that light")])
+    facts = {
+        "gaussians": len(splats),
+        "baking": {"light": light_facts(light, field, lamp), **baking},
+        "measured": measured,
+    }
     html = _html(trained, path, [replace(layer, about=text), *meshes], splats, first)
     return ScenePage(html, f"{trained.method} on {trained.scene.name}, {text}", facts)
 

@@ -148,7 +148,7 @@ def _range_of(depths_by_frame: Sequence[Float[np.ndarray, "K"]], what: str) -> D
         raise InputError(
             f"the depth range is unknown: {len(every)} {what}",
             f"at least {_FEWEST_POINTS}: sharp, overlapping frames of a camera that moves, with correct poses",
-            "Check the poses (coliags data check), use frames farther apart, or give `near` and `far`",
+            "Check the poses (coliags check data), use frames farther apart, or give `near` and `far`",
         )
     near, far = (factor * float(np.percentile(every, part)) for part, factor in (_NEAREST, _FARTHEST))
     measured = [index for index, depths in enumerate(depths_by_frame) if len(depths) >= _FEWEST_OF_FRAME]

@@ -128,7 +128,7 @@ def _write(
             f"no surface that {len(frames)} frames agree on: {100.0 * share:.1f} % of the pixels have a confidence of "
             f"{_KNOWN:g} or more",
             "sharp frames of the same surface from different positions, with correct poses",
-            "Check the poses (coliags data check), or the images: blurred or dark frames give no depth",
+            "Check the poses (coliags check data), or the images: blurred or dark frames give no depth",
         )
     train = [frame.name for frame in scene.train]
     test = [frame.name for frame in scene.test_sets.get("test", ())]

@@ -12,14 +12,16 @@ from coliags_plugin.core.cameras import Camera
 from coliags_plugin.geometry.meshes.mesh import TriangleMesh
 from coliags_plugin.geometry.meshes.truth import TrueSurface
 from coliags_plugin.reporting.colormaps import (
-    DEPTH_ERROR_LIMIT_MM,
     UNKNOWN_GREY,
     color_bar,
     colored,
+    scale_places,
     side_by_side,
     stacked,
 )
 
+#: Distances of the first and the last colour, mm; the same for all surfaces, so that they are comparable.
+_LIMITS = (0.0, 2.0)
 #: Height of each picture, px.
 HEIGHT = 320
 _SURROUNDINGS = 255
@@ -30,8 +32,8 @@ _AMBIENT = 0.45
 def distance_colors(
     distances: Float[np.ndarray, "N"], valid: Bool[np.ndarray, "N"] | None = None
 ) -> UInt8[np.ndarray, "N 3"]:
-    """Colours of distances on the scale of depth errors, 0 to 2 mm; grey where not valid."""
-    colors = colored(distances / DEPTH_ERROR_LIMIT_MM, "error")
+    """Colours of distances on the scale of errors, 0 to 2 mm; grey where not valid."""
+    colors = colored(scale_places(distances, _LIMITS, "error"), "error")
     if valid is not None:
         colors[~valid] = UNKNOWN_GREY
     return colors
@@ -63,7 +65,7 @@ def comparison_picture(mesh: TriangleMesh, truth: TrueSurface, cameras: Sequence
         )
         for number, (name, camera) in enumerate(views, start=1)
     ]
-    bar = color_bar((0.0, DEPTH_ERROR_LIMIT_MM), unit, width=max(row.shape[1] for row in rows))
+    bar = color_bar(_LIMITS, unit, width=max(row.shape[1] for row in rows))
     return stacked([*rows, bar])
 
 

@@ -21,6 +21,7 @@ class RoundGaussians(GaussianField):
 
     Settings = RoundGaussiansSettings
     primitive = "gaussians3d"
+    rates = {"means": {"lr": 0.00016, "times_extent": True}, "sizes": {"lr": 0.005}, "logits": {"lr": 0.02}}
 
     def __init__(self, settings, count):
         super().__init__()
@@ -60,5 +61,5 @@ class RoundGaussians(GaussianField):
         )
 
     def parameter_groups(self):
-        """Names for the config's ``optimizers``."""
+        """Names of ``rates``."""
         return {"means": [self.means], "sizes": [self.log_sizes], "logits": [self.logits]}

@@ -14,6 +14,7 @@ class Vignette(ViewModule):
 
     Settings = Settings
     whole_image = True  # shade asks where a pixel lies
+    rates = {"falloff": {"lr": 0.01}}
     untrained_views = "all views have the same vignette"
 
     def __init__(self, settings, scene):

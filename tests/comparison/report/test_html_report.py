@@ -16,11 +16,12 @@ import numpy as np
 import pytest
 
 from coliags_plugin.comparison.report.report import write_report
-from coliags_plugin.comparison.report.views import error_limit, evenly
+from coliags_plugin.comparison.report.views import evenly
 from coliags_plugin.config.options import ReportOptions
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.reporting.colormaps import color_table, depth_limits, hatch
-from coliags_plugin.reporting.image_files import EncodedImage, write_depth_tiff
+from coliags_plugin.reporting.colormaps import color_table, depth_limits, error_limit, hatch
+from coliags_plugin.reporting.image_files import EncodedImage, read_depth_tiff, write_depth_tiff
+from tests.commands import refused, run
 from tests.comparison.report.made import (
     FRAMES,
     HEIGHT,
@@ -78,7 +79,7 @@ class Page(HTMLParser):
 
 def report(tmp_path, paths, **options):
     output = tmp_path / "out" / "report.html"
-    write_report(paths, ReportOptions(output, **options))
+    write_report(paths, ReportOptions(output, overwrite=True, **options))
     return Page(output.read_text(encoding="utf-8"))
 
 
@@ -108,7 +109,8 @@ def test_one_file_that_needs_nothing_else(tmp_path, two_runs):
     html = (tmp_path / "out" / "report.html").read_text()
     assert html == (tmp_path / "again.html").read_text(), "the same runs give the same bytes"
     assert "@import" not in html and "import(" not in html and "fetch(" not in html
-    assert re.findall(r"url\((.*?)\)", html) == ["#depth-error-scale", "#depth-scale-0"]
+    scales = [f"#depth-{kind}-{index}" for index in range(len(FRAMES)) for kind in ("error-scale", "scale")]
+    assert re.findall(r"url\((.*?)\)", html) == scales
     assert "prefers-color-scheme: dark" in html
     style = html.split("<style>")[1].split("</style>")[0]
     used = {word for _, attributes in page.tags for word in (attributes.get("class") or "").split()}
@@ -139,8 +141,8 @@ def test_views_are_spread_over_each_set_and_the_worst_are_among_them(tmp_path):
         ("0100", "1 of 2", "worst PSNR and Depth MSE of coliags"),
         ("0110", "2 of 2", ""),
     ]
-    # truth, its depth, a rendering and its error; two of the slider; and the sample of the hatch
-    assert len(page.all("img")) == 6 * 4 + 2 + 1
+    # truth, its depth, a rendering and its error; two of the slider; and the sample of the hatch for each set
+    assert len(page.all("img")) == 6 * 4 + 2 + len(FRAMES)
 
 
 @pytest.mark.parametrize(
@@ -150,18 +152,20 @@ def test_evenly(length, count, indices):
     assert evenly(length, count) == indices
 
 
-def test_error_maps_share_one_scale(tmp_path, two_runs):
-    # The errors are 0.5 mm in one run and 1 mm in the other, so the scale ends at 1 mm.
-    page = report(tmp_path, two_runs)
-    table = color_table("error")
-    (first, *_), (second, *_) = (page.images(f"depth error of {name}") for name in ("coliags", "3dgs"))
-    assert first.shape == (HEIGHT, WIDTH, 3)
-    assert np.abs(first[5].astype(int) - table[128]).max() <= 2
-    assert (second[5] == table[255]).all()
-    assert not (first[0] == first[5]).all(), "pixels without truth look like pixels with one"
-    assert "|depth error| [mm] 0 0.2 0.4 0.6 0.8 1" in page.words
-    assert "depth [mm]" in page.words
-    assert "95 %" in page.words
+def test_error_maps_of_a_set_share_one_scale(tmp_path, two_runs):
+    """Errors are 0.5 mm in one run and 1 mm in the other, and ten times that off the path: the median is 0.75 mm."""
+    for folder in two_runs:
+        for file in (folder / "eval/paper/depth/rotation").iterdir():
+            true = read_depth_tiff(folder / "eval/paper/true_depth/rotation" / file.name)
+            write_depth_tiff(file, true + 10.0 * (read_depth_tiff(file) - true))
+    page, table = report(tmp_path, two_runs), color_table("error")
+    for name, error in (("coliags", 0.5), ("3dgs", 1.0)):
+        color = table[round(math.sqrt(error / 6.0) * 255)]
+        images = page.images(f"depth error of {name}")
+        assert len(images) == 4 and all(image.shape == (HEIGHT, WIDTH, 3) for image in images)
+        assert all(np.abs(image[5].astype(int) - color).max() <= 4 for image in images)
+        assert not any((image[0] == image[5]).all() for image in images), "pixels without truth look like known ones"
+    assert "|depth error| [mm] 0 0.3 1.2 3 6" in page.words and "|depth error| [mm] 0 3 12 30 60" in page.words
 
 
 @pytest.mark.parametrize("with_truth", [True, False])
@@ -176,7 +180,7 @@ def test_expected_depth_is_shown_and_hatched(tmp_path, with_truth):
             write_depth_tiff(run / "eval" / "paper" / "expected_depth" / name / f"{frame}.tiff", depth)
     page = report(tmp_path, [run])
     shown = page.images("expected depth of coliags")
-    assert len(shown) == 6
+    assert len(shown) == 4
     # The scale is that of the true depths, or without any of the expected ones, which are all alike.
     true = np.linspace(20, 60, HEIGHT * WIDTH).reshape(HEIGHT, WIDTH)[1:]
     low, high = depth_limits([true]) if with_truth else (40.0, 41.0)
@@ -190,15 +194,15 @@ def test_expected_depth_is_shown_and_hatched(tmp_path, with_truth):
 @pytest.mark.parametrize(
     ("errors", "limit"),
     [
-        ([np.array([0.0, 1.3]), np.array([1.3, np.inf])], 2.0),
-        ([np.linspace(0, 1, 101)], 1.0),
-        ([np.linspace(0, 1, 1_000_001)], 1.0),  # sampled
+        ([np.array([0.0, 1.3]), np.array([1.3, np.inf])], 11.0),  # 10.4, upwards
+        ([np.linspace(0, 1, 101), np.array([np.nan])], 4.1),
+        ([np.linspace(0, 1, 1_000_001)], 4.1),  # sampled
         ([], 1.0),
-        ([np.zeros(3)], 1e-6),
+        ([np.zeros(3)], 1.0),
     ],
 )
 def test_error_limit(errors, limit):
-    assert error_limit(errors) == limit
+    assert error_limit(errors) == pytest.approx(limit)
 
 
 def test_without_depth_colors_are_compared_and_large_images_reduced(tmp_path, two_runs):
@@ -206,7 +210,7 @@ def test_without_depth_colors_are_compared_and_large_images_reduced(tmp_path, tw
     page = report(tmp_path, [write_run(tmp_path / "run", result, depth=None)])
     assert page.images("true image")[0].shape == (33, 427, 3) and "1/3 of their size" in page.words
     assert "|colour error| [levels of 255]" in page.words
-    assert len(page.images("colour error of coliags")) == 6
+    assert len(page.images("colour error of coliags")) == 4
     assert "depth [mm]" not in page.words
     assert "Error against distance" not in page.words
     (two_runs[1] / "eval" / "paper" / "depth" / "test" / "0004.tiff").unlink()
@@ -262,8 +266,8 @@ def test_long_logs_are_drawn_through_means_one_curve_for_each_seed(tmp_path):
         assert text in page.words
     drawn = [attributes["d"] for attributes in page.all("path") if attributes["class"] == "line"]
     assert [path.count("L") for path in drawn].count(119) == 8
-    for run in runs:
-        (run / "metrics.jsonl").unlink()
+    for folder in runs:
+        (folder / "metrics.jsonl").unlink()
     assert "No training log" in report(tmp_path, runs).words
 
 
@@ -303,7 +307,8 @@ def test_every_scene_of_a_comparison_is_folded(tmp_path):
 
 
 def test_formats(tmp_path, two_runs):
-    files = write_report(two_runs, ReportOptions(tmp_path / "out/tables.html", formats=("all",)))
+    written = write_report(two_runs, ReportOptions(tmp_path / "out/tables.html", formats=("all", "text")))
+    files = written.files
     assert [file.name for file in files] == [f"tables.{kind}" for kind in ("html", "md", "tex", "csv", "json")]
     _, markdown, latex, table, values = (file.read_text() for file in files)
     assert markdown.startswith("# 2 methods compared on cecum") and r"\toprule" in latex
@@ -311,9 +316,39 @@ def test_formats(tmp_path, two_runs):
     values = json.loads(values)
     (summary, _) = values["sections"][0]["tables"]
     assert [(row["method"], row["psnr"]) for row in summary["rows"]] == [("coliags", 32.0), ("3dgs", 30.0)]
-    assert write_report(two_runs, ReportOptions(tmp_path / "table.txt", formats=("markdown",))) == [
-        tmp_path / "table.txt"
-    ]
+    assert [result.method for result in written.results] == ["coliags", "3dgs"]
+    assert re.search(r"\ncoliags +32.00.*\n3dgs +30.00", str(written))
+    one_format = ReportOptions(tmp_path / "table.txt", formats="markdown")
+    assert write_report(two_runs, one_format).files == [tmp_path / "table.txt"]
+
+
+def test_text_is_printed_and_json_has_the_results_whatever_the_format(two_runs, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    before = sorted(tmp_path.rglob("*"))
+    assert run("report", *two_runs, "--format", "text", "--columns", "psnr", "ssim") == 0
+    printed = capsys.readouterr().out
+    assert re.search(r"^coliags +32.00", printed, re.MULTILINE) and "written" not in printed
+    assert run("report", *two_runs, "--format", "text", "--json") == 0
+    values = json.loads(capsys.readouterr().out)
+    assert [(result["method"], result["psnr"]) for result in values["results"]] == [("coliags", 32.0), ("3dgs", 30.0)]
+    assert values["written"] == [] and values["results"][0]["facts"]["seed"] == "0"
+    for words in (("--format", "text", "-o", "x.txt"), ("--format",)):
+        assert "no format of files" in refused(capsys, "report", *two_runs, *words)
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_nothing_is_replaced_unless_asked_for(two_runs, tmp_path, capsys):
+    out = tmp_path / "out"
+    argv = ("report", two_runs[0], "--output", out / "r.html", "--format", "html", "csv")
+    assert run(*argv) == 0
+    for name in ("r.csv", "r_files/a.png"):
+        for file in out.glob("r.*"):
+            file.unlink()
+        (out / name).parent.mkdir(exist_ok=True)
+        (out / name).write_text("former")
+        assert f"{out / name.split('/')[0]} already exists" in refused(capsys, *argv)
+        assert [file.name for file in out.glob("r.*")] == [name] * (name == "r.csv")
+    assert run(*argv, "--overwrite") == 0 and "cecum" in (out / "r.csv").read_text()
 
 
 # Refusals

@@ -18,6 +18,7 @@ from coliags_plugin.reporting.model import Fact, Folded, Paragraph, Table, as_ce
 from coliags_plugin.results.hashing import metrics_sha256
 from coliags_plugin.results.record import MetricRecord
 from tests.comparison.report.made import FRAMES, METRICS, NO_LPIPS, decided, made_scenes, result_of, write_comparison
+from tests.results.made import made_set
 
 
 def blocks_of(section):
@@ -40,8 +41,11 @@ def entries(table, key):
     return {label(row): as_cell(row.get(key)) for row in table.rows}
 
 
-def paragraphs(page):
-    return " ".join(block.text for block in blocks_of(page.sections[0]) if isinstance(block, Paragraph))
+def notes(page):
+    """Notes of the tables of means, each of which is there once."""
+    texts = [note for block in page.sections[0].blocks if isinstance(block, Table) for note in block.notes]
+    assert len(texts) == len({*texts})
+    return " ".join(texts)
 
 
 def of(study_of, results, **choices):
@@ -57,7 +61,8 @@ def test_facts_and_title(study_of):
     assert facts["Image size"] == "16 \N{MULTIPLICATION SIGN} 12 px"
     assert facts["Protocol"] == "paper, version 1"
     assert facts["Evaluated with"] == "coliags_plugin 0.1.0"
-    assert facts["How the metrics are computed"] == "as in the <paper>"
+    (protocol,) = (block for block in blocks_of(page.sections[-1]) if getattr(block, "title", "") == "Protocol")
+    assert Fact("description", "as in the <paper>") in protocol.blocks[0].facts
     assert of(study_of, [result_of("coliags")], title="Mine", note="40 steps").title == "Mine"
     assert of(study_of, made_scenes({"coliags": 0}, scenes=14)).facts[0] == Fact("Scenes", "14")
 
@@ -134,7 +139,7 @@ MEANS = [
     (APART, "summary-test", "psnr", ("", "", None, "PSNR: no scene that all methods have")),
     # A scene without depth counts for PSNR, and for no depth metric.
     (FLAT, "summary-test", "depth_mse", ("0.250", "0.000", 1, f"Depth MSE: not available for flat; {NO_DEPTH}")),
-    (FLAT, "scene-flat-test", "depth_mse", ("", "", None, f"Depth MSE: {NO_DEPTH}")),
+    (FLAT, "scene-flat-test", "depth_mse", ("", "", None, "")),
 ]
 
 
@@ -144,19 +149,30 @@ def test_means_of_metrics(study_of, results, table, metric, cells):
     assert shown == (list(cells) if len(cells) > 1 else [*cells] * len(shown))
 
 
-DEPTHS = "Depth MSE; Depth MSE, inner; Depth median error; Depth AbsRel: "
+DEPTHS = "Depth MSE; Depth MSE, inner; Depth median error"
+NO_WEIGHTS = made_set(("0",), values={"lpips": (None,)}, reasons={"lpips": "no weights. To have some, run `x`"})
+REMEDY = result_of("coliags").model_copy(update={"sets": {"test": NO_WEIGHTS}})
+REMEDY = REMEDY.model_copy(update={"metrics_sha256": metrics_sha256(REMEDY.sets)})
 BY_FEW = [result_of(m, f"s{i}", depth=depth) for m, depths in RULED.items() for i, depth in enumerate(depths)]
 
 
 @pytest.mark.parametrize(
     ("results", "note"),
     [
-        (TWO, f"Not shown, without values: LPIPS: {NO_LPIPS}"),
-        ([measured("sparse_depth_median", "%", 3.0, NO_TRUTH)], f"Not shown, without values: {DEPTHS}estimated"),
+        (TWO, f"Not shown, without values: LPIPS ({NO_LPIPS})"),
+        (
+            [REMEDY],
+            f"Not shown, without values: PSNR; PSNR, seen pixels; SSIM; {DEPTHS} (no reason was recorded); "
+            "LPIPS (no weights)",
+        ),
+        (
+            [measured("sparse_depth_median", "%", 3.0, NO_TRUTH)],
+            f"Not shown, without values: LPIPS ({NO_LPIPS}); {DEPTHS} (estimated depth is no truth)",
+        ),
         (SEEDS, "± standard deviation over seeds"),
         (BY_FEW, "± standard deviation over scenes"),
         (scenes_without("3dgs", "scene-5"), "Means over 7 of 8 scenes, without scene-5"),
-        (FLAT, f"{DEPTHS}means over 2 of 3 scenes, without flat"),
+        (FLAT, f"{DEPTHS}; Depth AbsRel: means over 2 of 3 scenes, without flat"),
         (
             BY_FEW,
             "Depth MSE: few scenes rule the mean, which is more than twice the median over scenes, of coliags (0.01",
@@ -178,8 +194,16 @@ def test_the_summary_of_many_scenes_is_the_mean_over_those_that_all_have(study_o
     assert float(entry.spread) == pytest.approx(np.std(others, ddof=1), abs=0.005)
     assert any(caution.startswith("3dgs has no result of scene-5") for caution in page.cautions)
     assert [e.text for e in entries(tables(page)["lead-test-psnr"], "scenes").values()] == ["7", "8"]
-    assert entries(tables(page)["scene-scene-5-test"], "psnr")["3dgs"].note == "3dgs: no result"
-    assert [section.title for section in page.text_sections] == ["Metrics", "Costs", "Every scene"]
+    assert entries(tables(page)["scene-scene-5-test"], "psnr")["3dgs"].text == ""
+    assert [section.title for section in page.text_sections] == ["Metrics", "Details"]
+    details = page.text_sections[1].blocks
+    assert {type(block) for block in details} == {Folded}
+    assert [each.title for each in details] == [
+        "Lead of coliags over each method",
+        "Costs",
+        "Every scene",
+        "Provenance",
+    ]
 
 
 # Reference
@@ -209,7 +233,7 @@ def test_reference(study_of):
 def test_what_the_statistics_can_say(study_of, scenes, rivals, text):
     methods = {"coliags": 9.0} | {f"rival-{index}": 0.0 for index in range(rivals)}
     page = report_page(decided(study_of(made_scenes(methods, scenes)), "psnr"), ReportOptions())
-    assert text in paragraphs(page)
+    assert text in notes(page)
     table = tables(page)["summary-test"]
     stars = {entry.stars for label, entry in entries(table, "psnr").items() if label != "coliags"}
     assert stars == ({"*"} if (scenes, rivals) == (8, 6) else {""})
@@ -225,10 +249,10 @@ def test_a_rival_with_few_scenes_is_not_tested(study_of):
     results = made_scenes({"coliags": 2.0, "3dgs": 0.0, "2dgs": 1.0})
     page = of(study_of, [r for r in results if r.method != "2dgs" or r.scene.name < "scene-4"])
     lead = tables(page)["lead-test-psnr"]
-    assert entries(lead, "wilcoxon")["2dgs"].note == "fewer than 6 scenes in common"
+    assert entries(lead, "wilcoxon")["2dgs"].text == ""
     assert entries(lead, "wilcoxon")["3dgs"].text == ".0078"
     assert entries(lead, "smallest")["3dgs"].text == ".00781"
-    assert "for 2 rivals" in paragraphs(page)
+    assert "for 2 rivals" in notes(page)
     assert entries(lead, "wilcoxon_holm")["3dgs"].text == ".016"
 
 
@@ -239,11 +263,11 @@ def stars(page, metric, name="summary-test"):
 def test_only_what_was_decided_before_the_first_run_has_stars(study_of):
     study = study_of(made_scenes({"coliags": 9.0, "3dgs": 0.0, "2dgs": 4.0}))
     page = report_page(study, ReportOptions())
-    assert "before the first run (nothing)." in paragraphs(page)
+    assert "before the first run (nothing)." in notes(page)
     assert not stars(page, "psnr") and page.cautions == []
     page = report_page(decided(study, "depth_mse"), ReportOptions())
     assert stars(page, "depth_mse") == {"3dgs": "*", "2dgs": "*"} and not stars(page, "psnr")
-    assert "(coliags against the others by Depth MSE, on 2026-11-01)" in paragraphs(page)
+    assert "(coliags against the others by Depth MSE, on 2026-11-01)" in notes(page)
     other = report_page(decided(study, "psnr"), ReportOptions(reference="3dgs"))
     assert not stars(other, "psnr")
     best = report_page(decided(study, "psnr", reference="2dgs"), ReportOptions())
@@ -280,7 +304,7 @@ MOVED = changed(OURS, untrained_views={"poses": "poses are moved"})
 #: Results, and a part of each caution on them.
 CAUTIONS = {
     "code, steps and data": ([OURS, OTHER], "code: c1: coliags; c2: 3dgs.", "steps of training: 40: coliags; 80: 3dgs.",
-                             "different data, see Provenance: calibration."),
+                             "different data: calibration."),
     "nothing": ([OURS, THEIRS],),
     "codes of one method": (CODES, "code: c1: coliags (1 of 3); c1, evaluated by c2: coliags (1 of 3); "
                                    "c1, then c2, evaluated by c2: coliags (1 of 3)."),
@@ -293,7 +317,8 @@ CAUTIONS = {
               "image size: 16 x 12 px: a (1 of 2), b (1 of 2); 32 x 24 px: a (1 of 2), b (1 of 2)."),
     "untrained views": ([MOVED, THEIRS], "coliags, poses: poses are moved."),
     "untrained views of all methods": ([MOVED],),
-    "transparent pixels": ([transparent(0.1234)], *(f"cecum, set {name}: 12.3 % of the pixels" for name in FRAMES)),
+    "transparent pixels": ([transparent(0.1234)], "coliags on cecum, set test: 12.3 % of the pixels have alpha below "
+                           "0.5: their depth, hatched, means little. At most as many in 1 more set of views."),
     "few transparent pixels": ([transparent(0.01)],),
 }  # fmt: skip
 

@@ -48,6 +48,7 @@ def names(browser):
 
 
 def test_the_page_fits_and_nothing_is_loaded(opened):
+    assert opened.run("document.documentElement.scrollHeight") < 6000
     for state in ("open", "closed"):
         opened.run(f"document.querySelectorAll('details').forEach(each => each.open = {str(state == 'open').lower()})")
         assert opened.run("innerWidth") in (DESKTOP, PHONE)
@@ -173,7 +174,8 @@ def test_methods_frames_and_errors_are_chosen(opened):
 
 
 def curves(browser):
-    """Numbers of visible charts against steps, and against seconds."""
+    """Numbers of visible charts against steps, and against seconds, once what they are folded in is open."""
+    browser.run("document.querySelector('[data-switch=curves]').closest('details').open = true")
     visible = "document.querySelectorAll('figure.{}').values().filter(each => each.checkVisibility()).toArray().length"
     return [browser.run(visible.format(kind)) for kind in ("by-step", "by-seconds")]
 

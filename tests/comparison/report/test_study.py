@@ -9,7 +9,7 @@ from coliags_plugin.comparison.report.report import report_page
 from coliags_plugin.comparison.report.study import read_study
 from coliags_plugin.config.options import ReportOptions
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.reporting.model import Column, Paragraph
+from coliags_plugin.reporting.model import Column
 from coliags_plugin.results.reading import write_result
 from tests.comparison.report.made import FRAMES, made_scenes, result_of, write_comparison, write_plan, write_run
 
@@ -44,6 +44,7 @@ def test_a_run_a_file_and_a_comparison_are_read_alike(tmp_path):
         assert study.missing == ()
     assert read_study([run]).runs[0].run == run
     assert read_study([file]).runs[0].run is None
+    assert read_study([run / "eval/paper/result.json"]).runs[0].run == run
     other = write_run(tmp_path / "other", result_of("3dgs"))
     assert read_study([file, other]).methods == ["coliags", "3dgs"]
 
@@ -94,8 +95,8 @@ def test_the_family_is_all_that_was_planned_shown_or_not(compared):
         others = [row.tests.wilcoxon_holm / row.tests.wilcoxon for row in rows]
         assert max(others) == pytest.approx(4.0)  # as of the smallest p among four
         page = report_page(study, ReportOptions())
-        text = " ".join(block.text for block in page.sections[0].blocks if isinstance(block, Paragraph))
-        assert "after Holm's adjustment for 4 rivals: every method that was planned or given." in text
+        notes = " ".join(page.sections[0].blocks[1].notes)
+        assert "after Holm's adjustment for 4 rivals: every method that was planned or given." in notes
 
 
 def test_a_decision_holds_where_all_plans_have_it(tmp_path):
@@ -201,3 +202,21 @@ def test_runs_are_told_apart_by_their_stamps(tmp_path):
     runs = [write_run(tmp_path / name, result_of("a")) for name in ("one", "two", "sub/one")]
     assert [run.method for run in read_study(runs[:2]).runs] == ["a · one", "a · two"]
     assert [run.method for run in read_study([runs[0], runs[2]]).runs] == ["a · one (1)", "a · one (2)"]
+
+
+def test_versions_of_one_scene_are_evaluated_against_its_truth(tmp_path):
+    """Of estimated depth, whatever its frames are called; and copies that have other depth."""
+    truth = write_run(tmp_path / "true", result_of("3dgs", "colon"))
+    estimated = result_of("coliags", "colon-estimated", train=("7", "8"), data={"depth_is_estimated": True})
+    copy, same_name = result_of("coliags", "copy"), result_of("coliags", "colon")
+    sets = {name: part.model_copy(update={"truth_sha256": "f" * 64}) for name, part in same_name.sets.items()}
+    versions = {"estimated": estimated, "copy": copy, "other": same_name.model_copy(update={"sets": sets})}
+    for name, result in versions.items():
+        run = write_run(tmp_path / name, result)
+        to_do = (
+            rf"run `coliags eval {run} --truth SCENE`, .*, and report {run}/eval/paper-truth/result.json in its place"
+        )
+        refuses([run, truth], to_do)
+        if name == "estimated":
+            refuses([truth, run], to_do)
+    refuses([truth, write_run(tmp_path / "a", result_of("2dgs", "sigmoid", train=("9",)))], "Write one report for each")

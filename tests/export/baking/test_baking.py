@@ -7,6 +7,7 @@ import logging
 import math
 import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,15 +19,17 @@ from coliags_plugin.core.gaussians import Gaussians, rotation_matrices
 from coliags_plugin.core.lamps import FlattenedLight, LightOfCamera
 from coliags_plugin.core.ply import read_vertices, write_ply
 from coliags_plugin.core.scenes import Frame
-from coliags_plugin.engine.held_light import flattened_light, mean_camera
+from coliags_plugin.engine.held_light import flattened_light, mean_camera, render_held
+from coliags_plugin.engine.model import Model
 from coliags_plugin.engine.rendering import render_view
-from coliags_plugin.export.baking import distillation
+from coliags_plugin.export.baking import distillation, exporting
 from coliags_plugin.export.baking.baking import GaussianAverages, SeenColors, bake, blending_weights, fit_harmonics
 from coliags_plugin.export.baking.distillation import beside
-from coliags_plugin.export.baking.exporting import export_cost
+from coliags_plugin.export.baking.exporting import measure
 from coliags_plugin.export.splats.cloud import cloud_of_field, field_of_cloud
 from coliags_plugin.export.splats.formats import read_splats, write_splats
 from coliags_plugin.fields.spherical_harmonics import basis, colors
+from coliags_plugin.modules.exposure import CameraResponse, FrameGain
 from coliags_plugin.renderers.torch_renderer import TorchRenderer, TorchRendererSettings
 from tests.commands import refused, run
 from tests.export.splats.clouds import random_cloud
@@ -177,9 +180,10 @@ def test_an_imported_export_renders_what_the_run_renders(run_of, wall, tmp_path)
     record = json.loads((tmp_path / "wall.ply.json").read_text())
     assert record["baking"] is None and record["unit"] == "mm" and record["run"]["method"] == "3dgs"
     assert record["gaussians"] == len(read_splats(exported.file))
-    assert abs(record["cost"]["test"]["cost"]["psnr"]) < 1e-3
-    psnr = trained.evaluate().mean("psnr")
-    assert record["cost"]["test"]["run"]["psnr"] == pytest.approx(psnr, abs=1e-6)
+    measured, psnr = record["measured"]["test"], trained.evaluate().mean("psnr")
+    assert measured["run"]["psnr"] == pytest.approx(psnr, abs=1e-6)
+    for part in ("recorded", "in_light"):
+        assert measured[part] == pytest.approx(measured["run"], rel=1e-3)
     assert again.evaluate().mean("psnr") == pytest.approx(psnr, abs=1e-3)
     assert again.load().provenance["imported"]["gaussians"] == record["gaussians"]
 
@@ -191,20 +195,48 @@ def test_anchors_are_baked(anchors, wall, tmp_path, few_steps, capsys):
     printed = capsys.readouterr().out
     record = json.loads((tmp_path / "wall.spz.json").read_text())
     assert str(file) in printed
-    assert f"{record['cost']['test']['export']['psnr']:.2f} dB in that light" in printed
+    measured, lines = record["measured"]["test"], printed.splitlines()
+    said = (
+        f"{measured['recorded']['psnr']:.2f} dB on 2 held-out frames (test), the run {measured['run']['psnr']:.2f} dB"
+    )
+    assert lines[1] == f"in a viewer, against the recorded frames: {said}"
+    assert lines[2].startswith("in the baked light, flattened (the same everywhere): ")
+    assert f"{measured['in_light']['psnr']:.2f} dB on 2 held-out" in lines[2]
     assert record["baking"]["light"]["name"] == "flattened" and record["baking"]["steps"] == 3
     assert 0.9 < record["baking"]["light"]["cosine"] <= 1.0
-    cost = record["cost"]["test"]
-    assert cost["cost"]["psnr"] == pytest.approx(cost["run"]["psnr"] - cost["export"]["psnr"])
-    assert cost["psnr_between"] > 20
+    assert measured["psnr_between"] > 20
     assert record["sh_degree"] == 3 and record["gaussians"] == len(read_splats(file))
     assert run("import", file, "--data", wall, "--output", tmp_path / "imported") == 0
     imported = cp.load_run(tmp_path / "imported")
     assert imported.render(imported.frame_names()[0]).rgb.std() > 5
+    evaluated = imported.evaluate()
+    assert {name: evaluated.mean(name) for name in measured["recorded"]} == pytest.approx(
+        measured["recorded"], rel=1e-3
+    )
+
+
+@pytest.mark.parametrize(
+    ("recorded", "light", "warned"),
+    [
+        (31.7, "mean", None),
+        (
+            23.7,
+            "mean",
+            r"8\.9 dB\), as the lamp .* is baked; `coliags view RUN` .*light=recorded",
+        ),
+        (31.5, "recorded", r"1\.1 dB\), as frames have no gains; `coliags view RUN` shows the run itself$"),
+    ],
+)
+def test_another_brightness_than_the_videos_is_warned_of(caplog, recorded, light, warned):
+    measured = {"test": {"in_light": {"psnr": 32.6}, "recorded": {"psnr": recorded}}, "none": {"in_light": {}}}
+    measured["none"]["recorded"] = {}
+    exported = exporting.Exported(Path("a.ply"), Path("a.ply.json"), {"measured": measured})
+    exporting._warn_of_light(exported, light)
+    assert [bool(re.search(warned or "", message)) for message in caplog.messages] == [True] * (warned is not None)
 
 
 def test_several_formats_are_of_one_baking(anchors, tmp_path, few_steps):
-    exported = anchors.export(tmp_path / "wall.any", "ply", "spz", measure=False)
+    exported = anchors.export(tmp_path / "wall.any", formats=["ply", "spz"], measure=False)
     assert [part.file.name for part in exported] == ["wall.ply", "wall.spz"]
     first, second = (read_splats(part.file) for part in exported)
     assert len(first) == len(second) and "dB" not in exported[0].text
@@ -258,7 +290,7 @@ def test_distilled_colours_fall_with_the_distance_to_the_lamp(run_of, monkeypatc
         field = field_of_cloud(bake(trained, None, degree=0, attenuated=attenuated)[0])
         distillation.distil(field, trained, None, seconds=600.0)
         clouds.append(cloud_of_field(field))
-        between.append(export_cost(trained, clouds[-1], None)["test"]["psnr_between"])
+        between.append(measure(trained, clouds[-1], None)["test"]["psnr_between"])
     assert between[1] > between[0] + 3.0
     assert clouds[0].attenuation is None and np.median(clouds[1].attenuation[:, 1]) > 0.0
 
@@ -278,7 +310,7 @@ def test_a_view_starts_where_it_is_shown_best_of_the_far_half(run_of, monkeypatc
 def test_surfels_are_exported_thin_and_come_back_as_surfels(run_of, wall, tmp_path):
     trained = run_of("2dgs")
     record = trained.export(tmp_path / "wall.ply", seconds=0.0)[0].record
-    assert record["cost"]["test"]["psnr_between"] > 25
+    assert record["measured"]["test"]["psnr_between"] > 25
     thinnest = read_splats(tmp_path / "wall.ply").scales.min(axis=1)
     assert thinnest.min() > 0
     # A file of 2DGS has two scales: its import is a run of surfels.
@@ -326,6 +358,20 @@ def test_the_lamp_of_the_camera_itself_changes_nothing(run_of, method):
     torch.testing.assert_close(fixed.colors, moving.colors, atol=1e-5, rtol=1e-4)
 
 
+def test_a_held_view_has_the_response_of_a_camera_and_no_gain_of_a_frame(run_of):
+    trained = run_of("3dgs").load()
+    model, scene = trained.model, trained.scene
+    gain, response = FrameGain(FrameGain.Settings(), scene), CameraResponse(CameraResponse.Settings(knee=0.1), scene)
+    with torch.no_grad():
+        gain.log_gain.copy_(random(*gain.log_gain.shape))
+        response.log_slope.fill_(-0.5)
+        both = Model(model.field, model.renderer, {"gain": gain, "response": response}, model.near_plane)
+        camera = replace(scene.train[1].camera, camera_to_world=scene.train[1].camera.camera_to_world.float())
+        bare, shaded = (render_held(each, camera, None, ("rgb",)).rgb for each in (model, both))
+    torch.testing.assert_close(shaded, response.curve(bare))
+    assert (bare - shaded).max() > 0.05
+
+
 def test_flattened_light_is_even_over_a_wall(run_of):
     """Gaussians of one albedo and one normal look the same everywhere, however far they are."""
     field = run_of("pr-endo").load().model.field
@@ -354,7 +400,7 @@ def test_exports_that_cannot_be(run_of, anchors, tmp_path, capsys, few_steps):
     assert "already exists" in refused(capsys, "export", trained.path, "--output", tmp_path / "there.ply")
     assert (tmp_path / "there.ply").read_text() == "mine"
     with pytest.raises(InputError, match="no format 'sog'"):
-        trained.export(tmp_path / "a.sog", "sog")
+        trained.export(tmp_path / "a.sog", formats="sog")
     with pytest.raises(InputError, match="no light 'men'"):
         anchors.export(tmp_path / "a.ply", light="men")
     with pytest.raises(InputError, match="relit"):

@@ -231,7 +231,7 @@ def test_the_command_writes_a_page_that_needs_no_network(anchors, tmp_path, caps
     summary, written = capsys.readouterr().out.strip().splitlines()
     assert written == f"written: {page}" and summary.partition(", ")[2] in text
     assert re.search(
-        r"step 2; ([\d,]+) of \1 Gaussians; recorded light; \d+\.\d\d dB in that light on 2 held-out", summary
+        r"step 2; ([\d,]+) of \1 Gaussians; recorded light; in that light: \d+\.\d\d dB on 2 held-out", summary
     )
     assert "<title>wall (coliags)</title>" in text
     assert 'id="scene">{"layers":[{"about":"step 2; ' in text
@@ -250,7 +250,7 @@ def test_a_small_page_has_the_most_visible_gaussians(anchors):
     small = scene_page(trained, PageOptions(size=str(largest)))
     assert len(small.html.encode()) <= largest
     assert 0.4 < small.facts["gaussians"] / whole.facts["gaussians"] < 0.6
-    assert small.facts["cost"]["test"]["export"]["psnr"] > 10
+    assert small.facts["measured"]["test"]["in_light"]["psnr"] > 10
 
 
 def test_sizes():
@@ -274,11 +274,11 @@ def test_what_cannot_be_saved(run_of, tmp_path, capsys):
 
 def test_a_report_embeds_a_scene(anchors, tmp_path):
     anchors.evaluate()
-    (page,) = cp.report(anchors, tmp_path / "report.html", scene=anchors)
+    (page,) = cp.report(anchors, tmp_path / "report.html", scene=anchors).files
     text = page.read_text(encoding="utf-8")
     (embedded,) = re.findall(r'<iframe title="coliags on wall, seed 0" [^>]*data-page="([^"]*)"', text)
     assert 'id="scene"' in unescape(embedded) and "<title>wall (coliags)</title>" in unescape(embedded)
-    (plain,) = cp.report(anchors, tmp_path / "plain.html")
+    (plain,) = cp.report(anchors, tmp_path / "plain.html").files
     assert "<iframe" not in plain.read_text(encoding="utf-8")
 
 

@@ -1,4 +1,4 @@
-"""``coliags depth estimate`` as a user meets it: a textured wall with closed-form depth."""
+"""``coliags depth`` as a user meets it: a textured wall with closed-form depth."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+import coliags_plugin as cp
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import write_image, write_mask
 from coliags_plugin.core.scene_files import write_unit
@@ -24,6 +25,7 @@ from coliags_plugin.reconstruction.depth import estimate
 from coliags_plugin.reconstruction.depth.estimate import Estimation, WorkFolder, check_video
 from tests import commands
 from tests.commands import run
+from tests.faults import content
 from tests.reconstruction.depth.walls import NORMAL, OFFSET, sideways, wall_depth, wall_frames
 from tests.scenes import write_frames
 
@@ -40,13 +42,21 @@ def wall(tmp_path_factory):
 def estimated(wall, tmp_path_factory):
     """The wall with estimated depth, and what was printed is discarded."""
     out = tmp_path_factory.mktemp("estimates") / "out"
-    assert run("depth", "estimate", wall, "--output", out, *OPTIONS) == 0
+    assert run("depth", wall, "--output", out, *OPTIONS) == 0
     return out
+
+
+def test_the_function_writes_what_the_command_does(wall, estimated, tmp_path):
+    settings = {"depth.features.highlight_level": 256}
+    estimate = cp.estimate_depth(wall, tmp_path / "out", jobs=1, settings=settings)
+    assert content(tmp_path / "out") == content(estimated)
+    assert estimate.summary.startswith(f"{COUNT} frames, ") and estimate.settings == {}
+    assert len(cp.load_scene(estimate.folder).train) == 7
 
 
 def refused(capsys, *argv):
     """Message, in one line, of a command that must fail."""
-    return " ".join(commands.refused(capsys, "depth", "estimate", *argv).split())
+    return " ".join(commands.refused(capsys, "depth", *argv).split())
 
 
 def frames_of(folder, *options):
@@ -64,7 +74,7 @@ def contents(folder):
 
 @pytest.mark.thorough
 def test_the_data_check_trusts_the_estimate(estimated, capsys):
-    assert run("data", "check", estimated) == 0
+    assert run("check", "data", estimated) == 0
     assert "nothing suspect" in capsys.readouterr().out
 
 
@@ -102,7 +112,7 @@ def test_the_depth_of_training_frames_does_not_depend_on_the_images_of_test_fram
     outs = [estimated if split == "every-8th" else tmp_path / "whole", tmp_path / "out"]
     for source, out in zip((wall, noise), outs, strict=True):
         if not out.exists():
-            assert run("depth", "estimate", source, "--output", out, *OPTIONS, "--set", f"split={split}") == 0
+            assert run("depth", source, "--output", out, *OPTIONS, "--set", f"split={split}") == 0
     before, after = map(contents, outs)
     test = {frame.name for frame in open_scene(wall).test_sets["test"]}
     assert len(test) == 2
@@ -134,7 +144,7 @@ def test_a_prior_by_another_and_what_is_printed(wall, tmp_path, capsys):
     for frame in frames_of(wall):
         np.save(priors / f"{frame.name}.npy", 5.0 + 100.0 / wall_depth(frame.camera))
     options = ("--set", "split=endogslam", "--set", "max_frames=6", "--near", 20, "--far", 80)
-    assert run("depth", "estimate", wall, "--output", out, "--prior", priors, *OPTIONS, *options) == 0
+    assert run("depth", wall, "--output", out, "--prior", priors, *OPTIONS, *options) == 0
     summary, written, command = capsys.readouterr().out.splitlines()
     assert re.fullmatch(r"6 frames, \d+ % of the pixels with a confidence of 0.5 or more; \d+ points", summary)
     assert written == f"written: {out}"
@@ -156,7 +166,7 @@ def test_resuming_with_more_threads_gives_the_same_bytes(wall, estimated, tmp_pa
         saved.append((stage, index))
 
     monkeypatch.setattr(WorkFolder, "save", killed)
-    assert run("depth", "estimate", wall, "--output", out, *OPTIONS[:2], "--jobs", 1) == 130
+    assert run("depth", wall, "--output", out, *OPTIONS[:2], "--jobs", 1) == 130
     assert not out.exists()
     assert (tmp_path / ".out.work" / "swept-1").is_dir()
     again = []
@@ -165,7 +175,7 @@ def test_resuming_with_more_threads_gives_the_same_bytes(wall, estimated, tmp_pa
     before = cv2.getNumThreads()
     cv2.setNumThreads(8)
     try:
-        assert run("depth", "estimate", wall, "--output", out, *OPTIONS[:2], "--jobs", 3) == 0
+        assert run("depth", wall, "--output", out, *OPTIONS[:2], "--jobs", 3) == 0
         assert cv2.getNumThreads() == 8
     finally:
         cv2.setNumThreads(before)
@@ -185,7 +195,7 @@ def test_frames_keep_the_sweep_whose_depth_agrees_better(wall, tmp_path, monkeyp
 
     monkeypatch.setattr(WorkFolder, "save", kept)
     monkeypatch.setattr(estimate, "disagreement", lambda frame, neighbours: float(frame.depth.size))
-    assert run("depth", "estimate", wall, "--output", tmp_path / "out", *OPTIONS) == 0
+    assert run("depth", wall, "--output", tmp_path / "out", *OPTIONS) == 0
     for index in range(COUNT):
         first, last, chosen = (saved[stage, index] for stage in ("fused-0", "fused-1", "chosen"))
         for name, tolerance in (("depth", 0.4), ("confidence", 1e-6)):
@@ -202,9 +212,9 @@ def test_work_files_of_other_options_are_not_used(wall, tmp_path, monkeypatch, c
 
     with monkeypatch.context() as patch:
         patch.setattr(Estimation, "run", killed)
-        assert run("depth", "estimate", wall, "--output", out, *OPTIONS) == 130
+        assert run("depth", wall, "--output", out, *OPTIONS) == 130
     options = (*OPTIONS, "--set", "depth.agreement=0.03", "--set", "max_frames=5", "--set", "split=all-train")
-    assert run("depth", "estimate", wall, "--output", out, *options) == 0
+    assert run("depth", wall, "--output", out, *options) == 0
     assert "work files of other data or options are removed" in caplog.text
     assert len(frames_of(out)) == 5
 
@@ -225,7 +235,7 @@ def test_unit_mask_and_own_split_are_kept(estimated, tmp_path):
     (source / "transforms.json").write_text(json.dumps(content))
     write_unit(source, "unknown")
     out = tmp_path / "out"
-    assert run("depth", "estimate", source, "--output", out, *OPTIONS, "--set", "split=own") == 0
+    assert run("depth", source, "--output", out, *OPTIONS, "--set", "split=own") == 0
     assert (out / "unit.txt").read_text() == "unknown\n"
     scene = open_scene(out, options=["split=own", "initial_points=data"])
     assert [frame.name for frame in scene.test_sets["test"]] == [frames[0].name]
@@ -287,7 +297,7 @@ def test_black_or_blurred_frames_give_no_confident_depth(tmp_path, capsys, caplo
         capsys, nothing, "--output", tmp_path / "a", *OPTIONS, *near_far
     )
     some = write_frames(tmp_path / "some", [*frames[:4], *noisy(frames[4:5], level), *frames[5:]], depth=False)
-    assert run("depth", "estimate", some, "--output", tmp_path / "b", *OPTIONS, *near_far) == 0
+    assert run("depth", some, "--output", tmp_path / "b", *OPTIONS, *near_far) == 0
     frames_out = frames_of(tmp_path / "b")
     reason = f"mean weight of their own matches below 0.1: {frames_out[4].name}"
     assert f"1 of 9 frames have depth of confidence 0, {reason}" in caplog.messages
