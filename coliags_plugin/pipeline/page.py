@@ -304,12 +304,12 @@ def submap_table(contents: Contents) -> Table:
         Column("held_out", "Held out"),
         Column("psnr", "PSNR", "dB", "higher"),
         Column("ssim", "SSIM", "1", "higher"),
-        Column("psnr_pose_refined", "PSNR, pose refined", "dB"),
-        Column("psnr_training", "PSNR of training views", "dB"),
+        Column("psnr_pose_refined", "PSNR, pose refined", "dB", shown=False),
+        Column("psnr_training", "PSNR of training views", "dB", shown=False),
         Column("gap", "Gap", "dB", "lower"),
         Column("area", "Area"),
         Column("seen", "Seen", words=True),
-        Column("steps", "Steps"),
+        Column("steps", "Steps", shown=False),
         Column("time", "Time"),
     ]
     submaps, groups = contents.submaps, _groups(contents)
