@@ -82,7 +82,7 @@ def measured_geometry(trained: TrainedRun, mesh: TriangleMesh) -> dict[str, floa
         others, size = [*views[max(0, place - _REACH) : place], *views[place + 1 : place + 1 + _REACH]], view.depth.size
         depth, by_others, _ = depths_by(others, view)
         differs = np.abs(by_others[:, :size] / depth[:size] - 1.0) >= _DISAGREES
-        contradicted.append(float(differs.sum() / len(others) / max(1, np.isfinite(depth[:size]).sum())))
+        contradicted.append(float(differs.sum() / max(1, len(others)) / max(1, np.isfinite(depth[:size]).sum())))
     return {
         "parts": len(areas),
         "largest_part": float(areas.max() / areas.sum()),
