@@ -374,8 +374,8 @@ def evaluate(context: StageContext) -> StageRecord:
     trained = context.trained()
     result = evaluator.evaluate(trained, trained.config.protocol, refine_poses=True)
     folder = trained.run.evaluations / result.evaluation_name
-    figures = {name: result.sets[result.main_set].mean(name) for name in ("psnr", "ssim", "psnr_pose_refined")}
-    figures = {name: value for name, value in figures.items() if value is not None}
+    means = {name: result.sets[result.main_set].mean(name) for name in ("psnr", "ssim", "psnr_pose_refined")}
+    figures = {name: value for name, value in means.items() if value is not None}
     shown = ", ".join(f"{name.upper()} {figures[name]:.4g}" for name in ("psnr", "ssim") if name in figures)
     files = {str(folder.relative_to(context.folder)): "metrics and rendered frames"}
     figures |= {"held_out": sum(len(frames) for frames in trained.scene.test_sets.values()), **_training_psnr(trained)}

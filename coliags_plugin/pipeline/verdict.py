@@ -11,7 +11,7 @@ import torch
 
 from coliags_plugin.comparison.report.views import evenly
 from coliags_plugin.core.depth_maps import Pose, WeightedDepth, depths_by
-from coliags_plugin.engine.rendering import render_view
+from coliags_plugin.engine.rendering import opaque_depth, render_view
 from coliags_plugin.engine.trained import TrainedRun
 from coliags_plugin.geometry.meshes.mesh import TriangleMesh
 
@@ -72,7 +72,8 @@ def measured_geometry(trained: TrainedRun, mesh: TriangleMesh) -> dict[str, floa
         frame = frames[index]
         output = render_view(trained, frame, ("alpha", "depth_accumulated"))
         camera, valid = output.camera or frame.camera, frame.valid.cpu()
-        depth = torch.where(valid, output.expected_depth.cpu(), torch.nan).numpy()
+        expected = (opaque_depth(output, "depth_accumulated") / output.alpha).cpu()
+        depth = torch.where(valid, expected, torch.nan).numpy()
         views.append(WeightedDepth(Pose.of(camera), depth, np.ones_like(depth)))
         camera = camera.to("cpu", torch.float64)
         triangle, _ = mesh.rays.cast(camera.center.numpy(), camera.rays()[valid].numpy())
