@@ -19,7 +19,7 @@ class ListCommand:
 
     kind: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="[KIND]")] = "all"
     """A kind (methods, benchmarks, ablations, datamanagers, fields, renderers, ...), or all of them."""
-    name: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="[NAME]")] = ""
+    name: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="[NAME]", help_behavior_hint="")] = ""
     """A component of that kind, of which to print the options and default learning rates."""
     json: options.AsJson = False
 
