@@ -290,8 +290,8 @@ def _load_run(folder: Path) -> None:
 
 
 def _results(folder: Path) -> None:
-    _command("results", "show", folder)
-    _command("report", folder / "run", "--output", folder / "report.html")
+    _command("report", folder / "run", "--format", "text", "--json")
+    _command("report", folder / "run", "--output", folder / "report.html", "--overwrite")
 
 
 def _methods(folder: Path) -> None:
