@@ -167,7 +167,9 @@ def test_methods_frames_and_errors_are_chosen(opened):
     loaded = "Promise.all([...document.querySelectorAll('.stage img')].map(image => image.decode())).then(() => true)"
     assert opened.run(loaded)
     frames = opened.run("[...document.querySelector('[data-choice=frame]').options].map(option => option.text)")
-    assert frames[0] == "scene-1 · test · frame 0004" and any(frame.startswith("scene-2 · rotation") for frame in frames)
+    assert frames[0] == "scene-1 · test · frame 0004" and any(
+        frame.startswith("scene-2 · rotation") for frame in frames
+    )
     opened.click("article.frame:nth-of-type(2) .show-above")
     assert stage(opened)[1] == "frame 0020, absolute depth error of pr-endo"
     assert opened.run("document.activeElement.type") == "range"
