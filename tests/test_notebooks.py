@@ -30,7 +30,7 @@ def test_what_is_stored_is_small_whole_and_of_no_machine_and_on_its_page(path):
     assert TOOLS["plain"](notebook) == notebook | {"nbformat_minor": 5}, "make notebooks"
     page = TOOLS["as_markdown"](path)
     assert page.startswith("# ") and "```python\nimport" in page
-    assert len(re.findall('src="data:image/(png|jpeg);base64,', page)) >= 4 and page.count("<table") >= 2
+    assert len(re.findall('src="data:image/(png|jpeg);base64,', page)) >= 4 and "<table" in page
 
 
 def test_each_notebook_is_on_the_site_and_on_the_page_of_the_api():
