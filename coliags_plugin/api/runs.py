@@ -308,9 +308,7 @@ load_run = Run
 @takes(TrainOptions)
 @contextmanager
 def open_training(options: TrainOptions) -> Iterator[Trainer]:
-    """Trainer of a run, for a loop of your own over its steps (docs/api.md 4), until the block ends.
-
-    Images, poses and depth that contradict each other, as far as that is quickly seen, are warned of.
+    """Trainer of a run for a loop of your own (docs/api.md 4), until the block ends; suspect data are warned of.
 
     Raises:
         InputError: Method, data or options are invalid or do not fit each other; nothing was written.
