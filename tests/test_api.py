@@ -264,7 +264,7 @@ def test_examples_of_the_page_run(tmp_path, monkeypatch):
         monkeypatch.setattr(cp, name, quick(getattr(cp, name)), raising=False)
     for registered in ("_targets", "_sources"):
         monkeypatch.setattr(losses, registered, dict(vars(losses)[registered]))
-    names, text = {}, (ROOT / "docs" / "api.md").read_text(encoding="utf-8")
+    names, text = {}, (ROOT / "docs/api.md").read_text(encoding="utf-8")
     for block in re.findall(r"^```python\n(.*?)^```$", text, re.DOTALL | re.MULTILINE):
         exec(block, names)
     runs = {path.parent.name for path in tmp_path.glob("*/config.yaml")}
